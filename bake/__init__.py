@@ -1,0 +1,1 @@
+"""Light transport on plain arrays: a scene snapshot goes in, payloads for the voxel tree come out."""
