@@ -1,0 +1,53 @@
+"""The libraries that a worker process needs, and where this Blender found them."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from pathlib import Path
+
+NAMES = {"numpy": "numpy", "embreex": "embreex", "OpenEXR": "OpenEXR", "PIL": "pillow", "zstandard": "zstandard"}
+
+
+def missing() -> list[str]:
+    """Return the names of the libraries that cannot be imported.
+
+    Returns
+    -------
+    list of str
+        Names as on the Python Package Index, in the order of `NAMES`.
+    """
+    return [package for module, package in NAMES.items() if importlib.util.find_spec(module) is None]
+
+
+def search_path() -> str:
+    """Return a PYTHONPATH by which another process finds what this one found.
+
+    Returns
+    -------
+    str
+        Folders, each once, joined by the system's separator.
+    """
+    folders = []
+    for module in NAMES:
+        spec = importlib.util.find_spec(module)
+        if spec is None or not spec.origin:
+            continue
+        file = Path(spec.origin)
+        folder = file.parent.parent if spec.submodule_search_locations else file.parent
+        folders.append(str(folder))
+    return os.pathsep.join(dict.fromkeys(folders))
+
+
+def complaint() -> str:
+    """Return one line that names the missing libraries, or an empty string.
+
+    Returns
+    -------
+    str
+        What is missing and the remedy.
+    """
+    names = missing()
+    if not names:
+        return ""
+    return f"Missing: {', '.join(names)}. Install the extension's zip for this platform, which brings them"

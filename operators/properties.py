@@ -1,0 +1,149 @@
+"""Settings that live in the .blend file, and the command-line arguments that they stand for."""
+
+from pathlib import Path
+
+import bpy
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
+
+SCHEMA_VERSION = 1
+DEFAULT_FOLDER = "//gi_volumes/"
+
+QUALITIES = (
+    ("draft", "Draft", "Seconds to minutes; grainy, for checking the set-up"),
+    ("preview", "Preview", "For everyday work"),
+    ("final", "Final", "For shipping; slow"),
+)
+SUNS = (
+    ("scene", "Scene", "The sun lamps of the scene, as they stand"),
+    ("hemisphere", "Any Direction", "The sun may stand anywhere at run time; larger files"),
+    ("none", "None", "No sun"),
+)
+
+
+class SettingsError(ValueError):
+    """A setting that a bake cannot use; the message holds the remedy."""
+
+
+class GIVOLUMES_PG_scene(bpy.types.PropertyGroup):
+    """Settings of a bake."""
+
+    schema_version: IntProperty(default=SCHEMA_VERSION, options={"HIDDEN"})
+    output_folder: StringProperty(
+        name="Output Folder",
+        description="Folder that the bake is written to; // stands for the folder of the .blend file",
+        default=DEFAULT_FOLDER,
+        subtype="DIR_PATH",
+        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
+    )
+    quality: EnumProperty(
+        name="Quality",
+        description="How many light paths each data point gets, from few (Draft) to many (Final)",
+        items=QUALITIES,
+        default="preview",
+    )
+    sun: EnumProperty(
+        name="Sun",
+        description="Which sun directions the bake answers for",
+        items=SUNS,
+        default="scene",
+    )
+    finest: FloatProperty(
+        name="Finest Voxel",
+        description="Size of the smallest voxels, in metres (0.5 by default); scaled with very small and very large scenes",
+        default=0.5,
+        min=0.001,
+        soft_max=2.0,
+        subtype="DISTANCE",
+    )
+    threads: IntProperty(
+        name="Threads",
+        description="Processor threads to use; 0 (the default) uses all of them. The result does not depend on it",
+        default=0,
+        min=0,
+        soft_max=64,
+    )
+    seed: IntProperty(
+        name="Seed",
+        description="Number of the noise pattern (0 by default)",
+        default=0,
+        min=0,
+    )
+
+
+class GIVOLUMES_PG_light(bpy.types.PropertyGroup):
+    """Settings of a lamp."""
+
+    reflector: BoolProperty(
+        name="Reflector",
+        description="Bake this lamp's direct light too: a soft fill light, free at run time (off by default)",
+        default=False,
+    )
+
+
+CLASSES = (GIVOLUMES_PG_scene, GIVOLUMES_PG_light)
+
+
+def attach() -> None:
+    """Give scenes and lamps their settings."""
+    bpy.types.Scene.gi_volumes = PointerProperty(type=GIVOLUMES_PG_scene)
+    bpy.types.Light.gi_volumes = PointerProperty(type=GIVOLUMES_PG_light)
+
+
+def detach() -> None:
+    """Take the settings away again."""
+    del bpy.types.Light.gi_volumes
+    del bpy.types.Scene.gi_volumes
+
+
+def output_folder(scene: bpy.types.Scene) -> Path:
+    """Return the folder that a scene is baked to.
+
+    Parameters
+    ----------
+    scene : bpy.types.Scene
+        The scene.
+
+    Returns
+    -------
+    Path
+        An absolute path; the folder need not exist.
+
+    Raises
+    ------
+    SettingsError
+        No folder is set, or it is relative to a .blend file that has never been saved.
+    """
+    folder = scene.gi_volumes.output_folder.strip()
+    if not folder:
+        raise SettingsError("No output folder: set one in Render Properties > GI Volumes")
+    if folder.startswith("//") and not bpy.data.filepath:
+        raise SettingsError("Unsaved file: save the .blend first, or set an absolute output folder")
+    path = Path(bpy.path.abspath(folder))
+    if not path.is_absolute():
+        raise SettingsError(f"Output folder {folder!r} is neither absolute nor relative to the .blend file (//)")
+    return path
+
+
+def arguments(scene: bpy.types.Scene) -> dict[str, str]:
+    """Return the options of the command `bake` that a scene's settings stand for.
+
+    Parameters
+    ----------
+    scene : bpy.types.Scene
+        The scene.
+
+    Returns
+    -------
+    dict of str to str
+        Value of each option; options at their defaults are left out where the command knows the default.
+    """
+    settings = scene.gi_volumes
+    options = {
+        "--quality": settings.quality,
+        "--sun": settings.sun,
+        "--finest": f"{settings.finest:g}",
+        "--seed": str(settings.seed),
+    }
+    if settings.threads:
+        options["--threads"] = str(settings.threads)
+    return options

@@ -1,0 +1,38 @@
+"""What tests of several folders share."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="session")
+def repository() -> Path:
+    """The repository's root, which is the package."""
+    return REPOSITORY
+
+
+@pytest.fixture
+def run_python(tmp_path):
+    """Run a program in a Python of its own, with Blender's user files in a fresh folder."""
+
+    def run(program: str, *arguments: str, **options) -> subprocess.CompletedProcess:
+        environment = {**os.environ, "BLENDER_USER_RESOURCES": str(tmp_path / "user")}
+        return subprocess.run(
+            [sys.executable, "-c", program, *arguments],
+            capture_output=True,
+            text=True,
+            stdin=subprocess.DEVNULL,
+            env=environment,
+            cwd=tmp_path,
+            timeout=300,
+            **options,
+        )
+
+    return run
