@@ -1,0 +1,301 @@
+"""Light gathered at points, in parallel, the same however the work is split.
+
+Comes in: points and a sensor, which says what is measured there (nine harmonics of irradiance around a data
+point, or irradiance on a surface). Goes out: that measure for each transport. A point's samples are always
+summed in the same order and blocks, so results do not depend on tiles or threads.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from ..tree import harmonics
+from . import paths, warp
+from .paths import FAR, TARGET_SHORTENED, Numbers, Wave, unblocked
+from .scene import Scene
+from .sobol import Sampler, scramble
+
+TILE_LANES = 65536
+"""Paths in flight per thread: below, numpy's cost per call shows; above, they fall out of the cache."""
+
+BLOCK_SAMPLES = 1024
+"""Most samples of a point in one wavefront; part of the result's definition, as it orders the sums."""
+
+DIRECT_DIMENSIONS = paths.HASHED - 64
+"""Random numbers of the direct light at the point itself, apart from every path vertex's."""
+
+
+class Sensor(Protocol):
+    """What is measured at points: directions to sample, their density, and the response to radiance."""
+
+    responses: int
+
+    def sample(self, rows: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """(3, n) unit directions for the points `rows`."""
+
+    def pdf(self, rows: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """(n,) density of `sample` [1/sr]."""
+
+    def response(self, rows: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """(responses, n) measure of unit radiance from a direction."""
+
+
+class DataPoints:
+    """Measures the nine harmonics of irradiance around points in free space."""
+
+    responses = 9
+
+    def sample(self, rows, u, v):
+        """Uniform directions."""
+        return warp.sphere(u, v)
+
+    def pdf(self, rows, direction):
+        """Constant."""
+        return np.full(len(rows), warp.SPHERE_PDF, np.float32)
+
+    def response(self, rows, direction):
+        """Real harmonics times the cosine lobe's coefficients (Ramamoorthi and Hanrahan 2001, equation 8)."""
+        return harmonics.basis(direction.T).T * harmonics.COSINE.astype(np.float32)[:, None]
+
+
+class SurfacePoints:
+    """Measures irradiance on surfaces.
+
+    Parameters
+    ----------
+    normal : (3, n) float32 ndarray
+        Unit normals of all points.
+    """
+
+    responses = 1
+
+    def __init__(self, normal: np.ndarray) -> None:
+        self._normal = normal
+
+    def sample(self, rows, u, v):
+        """Directions by the cosine."""
+        return warp.cosine(u, v, self._normal[:, rows])
+
+    def pdf(self, rows, direction):
+        """The cosine over pi."""
+        return np.maximum(warp.dot(direction, self._normal[:, rows]), paths.GRAZING) * np.float32(1 / np.pi)
+
+    def response(self, rows, direction):
+        """The cosine, clamped."""
+        return np.maximum(warp.dot(direction, self._normal[:, rows]), 0)[None]
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much work to spend.
+
+    samples : paths per point
+    bounces : reflections that light may undergo before it arrives
+    seed : any integer; another seed gives an independent result
+    threads : worker threads; 0 uses every core
+    """
+
+    samples: int
+    bounces: int = 8
+    seed: int = 0
+    threads: int = 0
+
+
+@dataclass
+class Gathered:
+    """Measures at n points; an array has no rows where that light is not modelled.
+
+    local : (n, responses, 3) float32
+    sun : (n, keys, responses, 3) float32, per W/m2 of sun irradiance
+    sky : (n, functions, responses, 3) float32
+    """
+
+    local: np.ndarray
+    sun: np.ndarray
+    sky: np.ndarray
+
+
+class Cancelled(Exception):
+    """The caller asked to stop; nothing of the unfinished points is kept."""
+
+
+def gather(
+    scene: Scene,
+    sensor: Sensor,
+    position: np.ndarray,
+    keys: np.ndarray,
+    effort: Effort,
+    progress: Callable[[int], bool] | None = None,
+) -> Gathered:
+    """Measure light at points.
+
+    Parameters
+    ----------
+    scene : Scene
+        What light travels through.
+    sensor : Sensor
+        What is measured; its rows are those of `position`.
+    position : (3, n) float32 ndarray
+        Points [m], relative to the scene's origin.
+    keys : (n,) uint32 ndarray
+        Random key of each point.
+    effort : Effort
+        Samples, bounces, threads.
+    progress : callable, optional
+        Called with the number of points done so far, from the calling thread; returns False to stop.
+
+    Returns
+    -------
+    Gathered
+        Unbiased up to the bounce limit.
+
+    Raises
+    ------
+    Cancelled
+        `progress` returned False.
+    """
+    count = position.shape[1]
+    suns, functions = len(scene.model.suns.toward), scene.model.sky_count
+    shape = (sensor.responses, 3)
+    out = Gathered(
+        np.zeros((count if scene.has_local else 0, *shape), np.float32),
+        np.zeros((count if suns else 0, suns, *shape), np.float32),
+        np.zeros((count if functions else 0, functions, *shape), np.float32),
+    )
+    keys = _seeded(keys, effort.seed)
+
+    def work(rows: np.ndarray) -> int:
+        tile = _gather_tile(scene, sensor, position[:, rows], rows, keys[rows], effort)
+        if scene.has_local:
+            out.local[rows] = tile[:, 0]
+        out.sun[rows] = tile[:, 1 : 1 + suns] if suns else out.sun[rows]
+        out.sky[rows] = tile[:, 1 + suns :] if functions else out.sky[rows]
+        return len(rows)
+
+    size = max(1, TILE_LANES // min(effort.samples, BLOCK_SAMPLES))
+    tiles = [np.arange(first, min(first + size, count)) for first in range(0, count, size)]
+    run_tiles(work, tiles, effort.threads, progress)
+    return out
+
+
+def run_tiles(
+    work: Callable[[np.ndarray], int],
+    tiles: list[np.ndarray],
+    threads: int,
+    progress: Callable[[int], bool] | None = None,
+) -> None:
+    """Run independent tiles on threads; embreex and numpy release Python's lock.
+
+    Parameters
+    ----------
+    work : callable
+        Does one tile and returns how many points it held.
+    tiles : list of ndarray
+        The tiles, first come first served.
+    threads : int
+        How many at once; 0 uses every core.
+    progress : callable, optional
+        Called with the points done so far; returns False to stop.
+
+    Raises
+    ------
+    Cancelled
+        `progress` returned False; tiles that run are finished, the others never start.
+    """
+    done = 0
+    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
+        pending: set[Future] = {pool.submit(work, tile) for tile in tiles}
+        try:
+            while pending:
+                finished, pending = wait(pending, return_when=FIRST_COMPLETED)
+                done += sum(future.result() for future in finished)
+                if progress is not None and not progress(done):
+                    raise Cancelled
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+
+
+def _gather_tile(scene: Scene, sensor: Sensor, position, rows, keys, effort: Effort) -> np.ndarray:
+    """(points, channels, responses, 3) measures of one tile, block after block of samples."""
+    channels = 1 + len(scene.model.suns.toward) + scene.model.sky_count
+    total = np.zeros((len(rows), sensor.responses, 3 * channels))
+    for first in range(0, effort.samples, BLOCK_SAMPLES):
+        count = min(BLOCK_SAMPLES, effort.samples - first)
+        total += _gather_block(scene, sensor, position, rows, Sampler(keys, first, count), count, effort.bounces)
+    mean = (total / effort.samples).astype(np.float32)
+    return mean.reshape(len(rows), sensor.responses, channels, 3).transpose(0, 2, 1, 3)
+
+
+def _gather_block(scene: Scene, sensor: Sensor, position, rows, sampler: Sampler, count: int, bounces: int):
+    """(points, responses, channels * 3) sums over one block of samples."""
+    point, sample = np.divmod(np.arange(len(rows) * count), count)
+    numbers = Numbers(sampler, point, sample)
+    lanes = np.arange(len(point))
+    direction = sensor.sample(rows[point], *numbers.draw(lanes, 0, 2))
+    pdf = sensor.pdf(rows[point], direction)
+    start = np.ascontiguousarray(position[:, point])
+    wave = Wave(lanes, start.copy(), direction, np.ones_like(direction), pdf)
+    light = paths.trace(scene, wave, numbers, bounces)
+    stacked = np.concatenate([light.local[None], light.sun, light.sky])
+    stacked /= pdf
+    weights = sensor.response(rows[point], direction)
+    total = _project(weights, stacked.reshape(-1, len(lanes)), len(rows), count)
+    for channel, toward, value in _direct(scene, sensor, start, rows[point], numbers, lanes):
+        weights = sensor.response(rows[point], toward)
+        total[:, :, 3 * channel : 3 * channel + 3] += _project(weights, value, len(rows), count)
+    return total
+
+
+def _project(weights: np.ndarray, values: np.ndarray, points: int, count: int) -> np.ndarray:
+    """(points, responses, channels) sums over samples, as one matrix product for each point."""
+    left = np.ascontiguousarray(weights.reshape(-1, points, count).transpose(1, 0, 2))
+    right = np.ascontiguousarray(values.reshape(-1, points, count).transpose(1, 2, 0))
+    return (left @ right).astype(np.float64)
+
+
+def _direct(scene: Scene, sensor: Sensor, position, rows, numbers: Numbers, lanes):
+    """Direct light at the points themselves: (channel, directions, radiance over density) for each source.
+
+    Emissive surfaces and an uneven sky are also found by chance; the balance heuristic shares them out.
+    """
+    functions_start = 1 + len(scene.model.suns.toward)
+    if scene.model.local and scene.reflectors.count:
+        sample = scene.reflectors.sample(position, None, numbers.draw(lanes, DIRECT_DIMENSIONS, 4))
+        direction, length = _unit(sample.toward)
+        seen = (position, sample.toward, TARGET_SHORTENED, sample.irradiance.any(axis=0), sample.shadow)
+        yield 0, direction, _visible(scene, sample.irradiance, *seen)
+    if scene.model.local and scene.emitters.count:
+        toward, radiance, density = scene.emitters.sample(position, numbers.draw(lanes, DIRECT_DIMENSIONS + 4, 3))
+        direction, length = _unit(toward)
+        value = radiance / (density + sensor.pdf(rows, direction))
+        yield 0, direction, _visible(scene, value, position, toward, TARGET_SHORTENED, density > 0)
+    if scene.model.sky == "fixed" and scene.sky.uneven:
+        direction, radiance, density = scene.sky.sample(numbers.draw(lanes, DIRECT_DIMENSIONS + 7, 3))
+        value = radiance / (density + sensor.pdf(rows, direction))
+        yield functions_start, direction, _visible(scene, value, position, direction, FAR, density > 0)
+
+
+def _visible(scene: Scene, value: np.ndarray, position, toward, far, useful, shadow=None) -> np.ndarray:
+    """(3, n) values where the way is free, zero elsewhere."""
+    rows, tint = unblocked(scene, position, toward, far, useful, shadow)
+    out = np.zeros_like(value)
+    out[:, rows] = value[:, rows] * tint
+    return out
+
+
+def _unit(vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(unit vectors, lengths)."""
+    length = np.maximum(np.sqrt(warp.dot(vector, vector)), np.float32(1e-30))
+    return vector / length, length
+
+
+def _seeded(keys: np.ndarray, seed: int) -> np.ndarray:
+    """Keys that another seed makes unrelated."""
+    return scramble(scramble(keys, 0), (seed & 0x7FFFFFFF) + 1)

@@ -1,0 +1,191 @@
+"""Lamps: points, spots and area lights, sampled one shadow ray at a time.
+
+Comes in: points on surfaces. Goes out: for each a vector to a point of one lamp, and the irradiance that it
+brings on a surface facing it. The lamp is chosen by resampling: candidates are weighed by what they would bring
+without shadows, so that one shadow ray follows the light that matters.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from . import warp
+from .snapshot import LightKind, Lights
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
+"""Rec.709 weights."""
+
+CANDIDATES = 8
+"""Up to this many lamps are all weighed; of more, this many are drawn by their power and weighed."""
+
+NEAREST = np.float32(1e-3)
+"""Closer than this fraction of a metre a lamp's irradiance is held: a point lamp on a surface stays finite."""
+
+
+@dataclass(frozen=True)
+class LampSample:
+    """One lamp point for each lane.
+
+    toward : (3, n) float32 [m], from the surface to the lamp; not of unit length
+    irradiance : (3, n) float32 [W/m2] on a surface that faces it, over the sample's probability; 0 for none
+    shadow : (n,) bool, whether the way has to be free
+    """
+
+    toward: np.ndarray
+    irradiance: np.ndarray
+    shadow: np.ndarray
+
+
+class Lamps:
+    """Some lamps of a scene.
+
+    Parameters
+    ----------
+    lights : Lights
+        All lamps.
+    rows : (k,) int64 ndarray
+        The ones to use; suns are not allowed.
+    origin : (3,) float64 ndarray
+        The snapshot's origin [m].
+    """
+
+    def __init__(self, lights: Lights, rows: np.ndarray, origin: np.ndarray) -> None:
+        self.count = len(rows)
+        self._kind = lights.kind[rows]
+        self._position = (lights.position[rows] - origin).astype(np.float32).T
+        frame = lights.frame[rows]
+        self._x, self._y, self._z = (np.ascontiguousarray(frame[:, :, axis].T) for axis in range(3))
+        self._strength = np.ascontiguousarray(lights.strength[rows].T)
+        self._size = np.ascontiguousarray(lights.size[rows].T)
+        self._spot = np.ascontiguousarray(lights.spot[rows].T)
+        self._shadow = lights.shadow[rows]
+        power = _power(self._kind, self._strength, self._size, self._spot)
+        total = power.sum()
+        self._pmf = (power / total if total > 0 else np.full(self.count, 1 / max(self.count, 1))).astype(np.float32)
+        self._cdf = np.cumsum(self._pmf, dtype=np.float64)
+
+    def sample(self, position: np.ndarray, normal: np.ndarray | None, u: tuple[np.ndarray, ...]) -> LampSample:
+        """Choose a lamp and a point on it for every lane.
+
+        Parameters
+        ----------
+        position : (3, n) float32 ndarray
+            Points [m].
+        normal : (3, n) float32 ndarray, or None
+            Facing unit normals; None weighs all directions alike.
+        u : four (n,) float32 ndarrays
+            Uniform numbers: candidates, the choice among them, where on the lamp.
+
+        Returns
+        -------
+        LampSample
+            Unbiased: its expectation is the sum over all lamps.
+
+        Notes
+        -----
+        Source: Talbot 2005, resampled importance sampling, with a streaming reservoir (Bitterli et al. 2020).
+        """
+        draw, pick, u1, u2 = u
+        lanes = position.shape[1]
+        kept = LampSample(np.ones_like(position), np.zeros_like(position), np.zeros(lanes, bool))
+        kept_weight = np.ones(lanes, np.float32)
+        total = np.zeros(lanes, np.float32)
+        for lamp, inverse_density in self._candidates(draw):
+            toward, irradiance = self._evaluate(lamp, position, u1, u2)
+            value = LUMINANCE @ irradiance
+            if normal is not None:
+                value = value * np.maximum(warp.dot(normal, toward), 0) / np.sqrt(warp.dot(toward, toward))
+            weight = value * inverse_density
+            total += weight
+            share = np.divide(weight, total, out=np.zeros_like(weight), where=total > 0)
+            take = pick < share
+            pick = _reuse(pick, share, take)
+            _keep(kept, take, toward, irradiance, np.broadcast_to(self._shadow[lamp], (lanes,)))
+            kept_weight[take] = value[take]
+        kept.irradiance[...] *= np.divide(total, kept_weight)
+        return kept
+
+    def _candidates(self, draw: np.ndarray):
+        """(lamp numbers, inverse of the density they were drawn with); one number stands for all lanes."""
+        if self.count <= CANDIDATES:
+            for lamp in range(self.count):
+                yield np.array([lamp]), np.float32(1)
+            return
+        for step in range(CANDIDATES):
+            drawn = (step + draw) / CANDIDATES * self._cdf[-1]
+            lamp = np.minimum(np.searchsorted(self._cdf, drawn, side="right"), self.count - 1)
+            yield lamp, 1 / (CANDIDATES * self._pmf[lamp])
+
+    def _evaluate(self, lamp: np.ndarray, position: np.ndarray, u1: np.ndarray, u2: np.ndarray):
+        """(vector to a point of the lamp, irradiance it brings on a surface facing it)."""
+        center = self._position[:, lamp] - position
+        round_lamp = self._kind[lamp] <= LightKind.SPOT
+        if round_lamp.all():
+            return self._evaluate_round(lamp, center, u1, u2)
+        if not round_lamp.any():
+            return self._evaluate_area(lamp, center, u1, u2)
+        first, second = self._evaluate_round(lamp, center, u1, u2), self._evaluate_area(lamp, center, u1, u2)
+        return tuple(np.where(round_lamp, a, b) for a, b in zip(first, second, strict=True))
+
+    def _evaluate_round(self, lamp, center, u1, u2) -> tuple[np.ndarray, np.ndarray]:
+        """Points and spots: a disk that always faces the surface, of the lamp's radius."""
+        distance = np.maximum(np.sqrt(warp.dot(center, center)), NEAREST)
+        axis = center / distance
+        toward = center
+        radius = self._size[0, lamp]
+        if radius.any():
+            x, y = warp.disk(u1, u2)
+            tangent, bitangent = warp.frame(axis)
+            toward = center + (tangent * x + bitangent * y) * np.minimum(radius, distance)
+        squared = np.maximum(warp.dot(toward, toward), NEAREST * NEAREST)
+        facing = warp.dot(toward, axis) / np.sqrt(squared)
+        falloff = np.maximum(facing, 0) / squared * self._cone(lamp, axis)
+        return toward, self._strength[:, lamp] * falloff
+
+    def _cone(self, lamp: np.ndarray, axis: np.ndarray) -> np.ndarray:
+        """Blender's spot: a smooth step in the cosine, over the blend."""
+        cos_half, blend = self._spot[:, lamp]
+        if (cos_half <= -1).all():
+            return np.float32(1)
+        z = self._z[:, lamp]
+        cosine = axis[0] * z[0] + axis[1] * z[1] + axis[2] * z[2]
+        t = np.clip((cosine - cos_half) / np.maximum((1 - cos_half) * blend, np.float32(1e-6)), 0, 1)
+        return np.where(cos_half <= -1, np.float32(1), t * t * (3 - 2 * t))
+
+    def _evaluate_area(self, lamp, center, u1, u2) -> tuple[np.ndarray, np.ndarray]:
+        """Rectangles and ellipses: uniform points of their area, shining to one side by the cosine."""
+        ellipse = self._kind[lamp] == LightKind.ELLIPSE
+        x, y = u1 - np.float32(0.5), u2 - np.float32(0.5)
+        area = self._size[0, lamp] * self._size[1, lamp]
+        if ellipse.any():
+            disk_x, disk_y = warp.disk(u1, u2)
+            x, y = np.where(ellipse, disk_x / 2, x), np.where(ellipse, disk_y / 2, y)
+            area = np.where(ellipse, area * np.float32(np.pi / 4), area)
+        toward = center + self._x[:, lamp] * (x * self._size[0, lamp]) + self._y[:, lamp] * (y * self._size[1, lamp])
+        squared = np.maximum(warp.dot(toward, toward), NEAREST * NEAREST)
+        z = self._z[:, lamp]
+        cosine = (toward[0] * z[0] + toward[1] * z[1] + toward[2] * z[2]) / np.sqrt(squared)
+        return toward, self._strength[:, lamp] * (area * np.maximum(cosine, 0) / squared)
+
+
+def _power(kind: np.ndarray, strength: np.ndarray, size: np.ndarray, spot: np.ndarray) -> np.ndarray:
+    """Emitted power, to draw candidates by [W]."""
+    luminance = LUMINANCE @ strength
+    area = size[0] * size[1] * np.where(kind == LightKind.ELLIPSE, np.pi / 4, 1)
+    return luminance * np.where(kind <= LightKind.SPOT, 2 * np.pi * (1 - spot[0]), np.pi * area)
+
+
+def _reuse(u: np.ndarray, share: np.ndarray, take: np.ndarray) -> np.ndarray:
+    """What is left of a uniform number after a choice made with it is uniform again."""
+    kept = u / np.where(take, share, 1)
+    left = (u - share) / np.where(take, 1, np.maximum(1 - share, np.float32(1e-7)))
+    return np.clip(np.where(take, kept, left), 0, np.float32(1 - 2.0**-24))
+
+
+def _keep(kept: LampSample, take: np.ndarray, toward, irradiance, shadow) -> None:
+    """Replace the reservoir's sample where the new one was taken."""
+    np.copyto(kept.toward, toward, where=take)
+    np.copyto(kept.irradiance, irradiance, where=take)
+    np.copyto(kept.shadow, shadow, where=take)

@@ -1,0 +1,408 @@
+"""The path tracer: wavefronts of paths that carry all three transports at once.
+
+Comes in: rays and their random numbers. Goes out: for each ray the radiance that comes back along it, apart for
+local light, for every sun key and for every function of the sky. Unbiased but for the bounce limit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..tree import harmonics
+from . import warp
+from .rays import MISS, SKIP, Hits
+from .scene import Scene
+from .sobol import Sampler
+
+ROULETTE_START = 3
+"""Bounces before Russian roulette may end a path: earlier ends cost more noise than they save time."""
+
+PASS_LIMIT = 32
+"""Transparent surfaces that one ray may cross; the next one is taken as opaque."""
+
+TARGET_SHORTENED = np.float32(0.9999)
+"""Shadow rays stop short of the surface they aim at by this share."""
+
+GRAZING = np.float32(1e-6)
+"""Least cosine of a density, so that no weight divides zero by zero."""
+
+FAR = np.float32(1e30)
+"""Length of a ray to the sun or the sky, in lengths of its direction."""
+
+# Dimensions of the random numbers. The first two choose the path's first direction.
+FIRST_VERTEX = 2
+SCATTER, LAMP, EMITTER, SKY, PER_VERTEX = 0, 2, 6, 9, 12
+HASHED = 1 << 16
+"""Dimensions from here on are hashed, not Sobol points: roulette, transparency, the sun's disk."""
+ROULETTE, SUN_DISK, PASS, HASHED_PER_VERTEX = 0, 1, 3, 64
+
+
+@dataclass
+class Radiance:
+    """Radiance that comes back along rays, for n rays.
+
+    local : (3, n) float32 [W/(m2 sr)]
+    sun : (keys, 3, n) float32, per W/m2 of sun irradiance [1/sr]
+    sky : (functions, 3, n) float32, [W/(m2 sr)] of a fixed sky, or per unit of each harmonic
+    """
+
+    local: np.ndarray
+    sun: np.ndarray
+    sky: np.ndarray
+
+    @classmethod
+    def zeros(cls, scene: Scene, lanes: int) -> Radiance:
+        """No light yet."""
+        suns, functions = len(scene.model.suns.toward), scene.model.sky_count
+        shapes = ((3, lanes), (suns, 3, lanes), (functions, 3, lanes))
+        return cls(*(np.zeros(shape, np.float32) for shape in shapes))
+
+
+@dataclass
+class Wave:
+    """The paths that are still alive, stored by component.
+
+    lane : (n,) int64, the ray that each path belongs to
+    origin : (3, n) float32 [m]
+    direction : (3, n) float32, unit length
+    beta : (3, n) float32, throughput
+    pdf : (n,) float32 [1/sr], density of `direction`, to weigh emitters and sky found by chance
+    """
+
+    lane: np.ndarray
+    origin: np.ndarray
+    direction: np.ndarray
+    beta: np.ndarray
+    pdf: np.ndarray
+
+    def take(self, rows: np.ndarray) -> Wave:
+        """Some of the paths."""
+        return Wave(self.lane[rows], self.origin[:, rows], self.direction[:, rows], self.beta[:, rows], self.pdf[rows])
+
+
+class Numbers:
+    """Random numbers of the rays: lane i is sample `sample[i]` of point `point[i]`."""
+
+    def __init__(self, sampler: Sampler, point: np.ndarray, sample: np.ndarray) -> None:
+        self._sampler, self._point, self._sample = sampler, point, sample
+
+    def draw(self, lane: np.ndarray, first: int, count: int) -> tuple[np.ndarray, ...]:
+        """`count` uniform numbers for each lane, from dimension `first` on."""
+        point, sample = self._point[lane], self._sample[lane]
+        return tuple(self._sampler.uniform(point, sample, first + k) for k in range(count))
+
+
+def trace(scene: Scene, wave: Wave, numbers: Numbers, bounces: int) -> Radiance:
+    """Follow paths until they leave, are absorbed, or have been reflected `bounces` times.
+
+    Parameters
+    ----------
+    scene : Scene
+        What they travel through.
+    wave : Wave
+        One path for each ray, `lane` counting from 0, `beta` 1; used up.
+    numbers : Numbers
+        Their random numbers.
+    bounces : int
+        Reflections that light may undergo; 0 sees emitters and sky only.
+
+    Returns
+    -------
+    Radiance
+        Direct light of lamps and suns along the rays is not part of it: they are no surfaces.
+
+    Notes
+    -----
+    Error: unbiased up to the bounce limit; noise only. Tested against closed forms in `tests/bake`.
+    Source: Kajiya 1986; Veach 1997, section 9.2, balance heuristic for emitters and an uneven sky.
+    """
+    light = Radiance.zeros(scene, len(wave.lane))
+    for bounce in range(bounces + 1):
+        wave, hits, travelled = _advance(scene, wave, numbers, bounce, light)
+        if not len(wave.lane):
+            break
+        _add_emission(scene, wave, hits, travelled, light)
+        if bounce == bounces:
+            break
+        vertex = _arrive(scene, wave, hits, travelled)
+        _add_lamps(scene, wave, vertex, numbers, bounce, light)
+        _add_emitters(scene, wave, vertex, numbers, bounce, light)
+        _add_suns(scene, wave, vertex, numbers, bounce, light)
+        _add_sky(scene, wave, vertex, numbers, bounce, light)
+        wave = _scatter(wave, vertex, numbers, bounce)
+    return light
+
+
+@dataclass
+class Vertex:
+    """Where paths meet surfaces: points [m] off the surface, facing unit normals, reflectance; by component."""
+
+    position: np.ndarray
+    normal: np.ndarray
+    reflectance: np.ndarray
+
+
+def _advance(scene: Scene, wave: Wave, numbers: Numbers, bounce: int, light: Radiance):
+    """Trace to the next opaque hit; paths that leave collect the sky. Returns (paths, hits, metres travelled)."""
+    travelled = np.zeros(len(wave.lane), np.float32)
+    hits = scene.tracer.intersect(wave.origin, wave.direction)
+    if scene.tracer.has_transparent:
+        hits, travelled = _pass_through(scene, wave, hits, numbers, bounce)
+    alive = hits.triangle != MISS
+    if not alive.all():
+        _add_escaped(scene, wave.take(np.flatnonzero(~alive)), light)
+        rows = np.flatnonzero(alive)
+        wave, hits, travelled = wave.take(rows), _take_hits(hits, rows), travelled[rows]
+    return wave, hits, travelled + hits.distance
+
+
+def _pass_through(scene: Scene, wave: Wave, hits: Hits, numbers: Numbers, bounce: int):
+    """Let paths through transparent surfaces by chance. Returns (hits, metres before the last leg)."""
+    travelled = np.zeros(len(wave.lane), np.float32)
+    active = _transparent_rows(scene, hits, np.arange(len(wave.lane)))
+    for step in range(PASS_LIMIT):
+        if not len(active):
+            break
+        triangle, u, v = hits.triangle[active], hits.u[active], hits.v[active]
+        passed, covered = scene.surfaces.through(triangle, u, v)
+        chance = passed.mean(axis=0)
+        dimension = HASHED + bounce * HASHED_PER_VERTEX + PASS + step
+        passes = numbers.draw(wave.lane[active], dimension, 1)[0] < chance
+        stays = active[~passes]
+        wave.beta[:, stays] *= (covered / np.maximum(1 - chance, np.float32(1e-6)))[~passes]
+        goes = active[passes]
+        wave.beta[:, goes] *= (passed / np.maximum(chance, np.float32(1e-6)))[:, passes]
+        travelled[goes] += _step_past(scene, wave, hits, goes)
+        _put_hits(hits, goes, scene.tracer.intersect(wave.origin[:, goes], wave.direction[:, goes]))
+        active = _transparent_rows(scene, hits, goes)
+    return hits, travelled
+
+
+def _step_past(scene: Scene, wave: Wave, hits: Hits, rows: np.ndarray) -> np.ndarray:
+    """Move origins beyond the surfaces they hit; returns the metres moved."""
+    distance = hits.distance[rows]
+    position = wave.origin[:, rows] + wave.direction[:, rows] * distance
+    step = distance + scene.tracer.offset(position, distance)
+    wave.origin[:, rows] += wave.direction[:, rows] * step
+    return step
+
+
+def _add_escaped(scene: Scene, wave: Wave, light: Radiance) -> None:
+    """Sky that paths find by leaving the scene."""
+    if scene.model.sky == "harmonics":
+        basis = harmonics.basis(wave.direction.T)
+        light.sky[:, :, wave.lane] += basis.T[:, None, :] * wave.beta
+    elif scene.model.sky == "fixed" and not scene.sky.dark:
+        radiance = wave.beta * scene.sky.radiance(wave.direction)
+        if scene.sky.uneven:
+            radiance = radiance * (wave.pdf / (wave.pdf + scene.sky.pdf_solid_angle(wave.direction)))
+        light.sky[0][:, wave.lane] += radiance
+
+
+def _add_emission(scene: Scene, wave: Wave, hits: Hits, travelled: np.ndarray, light: Radiance) -> None:
+    """Emissive surfaces that paths find by chance."""
+    if not scene.model.local or not scene.emitters.count:
+        return
+    rows = np.flatnonzero(scene.surfaces.emissive[hits.triangle])
+    if not len(rows):
+        return
+    triangle, normal, direction = hits.triangle[rows], hits.normal[:, rows], wave.direction[:, rows]
+    cosine = np.abs(warp.dot(normal, direction)) / np.sqrt(warp.dot(normal, normal))
+    other = scene.emitters.pdf_solid_angle(triangle, travelled[rows], cosine)
+    weight = wave.pdf[rows] / (wave.pdf[rows] + other)
+    radiance = scene.surfaces.emission(triangle, hits.u[rows], hits.v[rows])
+    light.local[:, wave.lane[rows]] += wave.beta[:, rows] * radiance * weight
+
+
+def _arrive(scene: Scene, wave: Wave, hits: Hits, travelled: np.ndarray) -> Vertex:
+    """Points off the surface on the side that the path came from."""
+    length = np.sqrt(warp.dot(hits.normal, hits.normal))
+    facing = -np.copysign(np.float32(1), warp.dot(hits.normal, wave.direction)) / np.maximum(length, np.float32(1e-37))
+    normal = hits.normal * facing
+    position = wave.origin + wave.direction * hits.distance
+    position += normal * scene.tracer.offset(position, travelled)
+    reflectance = scene.surfaces.reflectance(hits.triangle, hits.u, hits.v)
+    return Vertex(position, normal, reflectance)
+
+
+def _add_lamps(scene: Scene, wave: Wave, vertex: Vertex, numbers: Numbers, bounce: int, light: Radiance) -> None:
+    """One shadow ray to one lamp."""
+    if not scene.model.local or not scene.lamps.count:
+        return
+    u = numbers.draw(wave.lane, FIRST_VERTEX + bounce * PER_VERTEX + LAMP, 4)
+    sample = scene.lamps.sample(vertex.position, vertex.normal, u)
+    length = np.sqrt(warp.dot(sample.toward, sample.toward))
+    cosine = np.maximum(warp.dot(sample.toward, vertex.normal), 0) / np.maximum(length, np.float32(1e-30))
+    value = sample.irradiance * cosine
+    rows, tint = unblocked(scene, vertex.position, sample.toward, TARGET_SHORTENED, value.any(axis=0), sample.shadow)
+    _collect(light.local, wave, vertex, rows, value[:, rows] * tint)
+
+
+def _add_emitters(scene: Scene, wave: Wave, vertex: Vertex, numbers: Numbers, bounce: int, light: Radiance) -> None:
+    """One shadow ray to one emissive triangle, weighed against finding it by chance."""
+    if not scene.model.local or not scene.emitters.count:
+        return
+    u = numbers.draw(wave.lane, FIRST_VERTEX + bounce * PER_VERTEX + EMITTER, 3)
+    toward, radiance, density = scene.emitters.sample(vertex.position, u)
+    length = np.sqrt(warp.dot(toward, toward))
+    cosine = np.maximum(warp.dot(toward, vertex.normal), 0) / np.maximum(length, np.float32(1e-30))
+    total = density + cosine / np.float32(np.pi)
+    useful = (cosine > 0) & (density > 0)
+    value = radiance * np.divide(cosine, total, out=np.zeros_like(cosine), where=useful)
+    rows, tint = unblocked(scene, vertex.position, toward, TARGET_SHORTENED, useful)
+    _collect(light.local, wave, vertex, rows, value[:, rows] * tint)
+
+
+def _add_suns(scene: Scene, wave: Wave, vertex: Vertex, numbers: Numbers, bounce: int, light: Radiance) -> None:
+    """One shadow ray to every sun key: choosing one of many is far noisier than it is cheap."""
+    keys = scene.model.suns
+    for key in range(len(keys.toward)):
+        dimension = HASHED + bounce * HASHED_PER_VERTEX + SUN_DISK
+        u = numbers.draw(wave.lane, dimension, 2) if keys.diameter[key] > 0 else None
+        toward = sun_direction(keys.toward[key], keys.diameter[key], u, len(wave.lane))
+        cosine = np.maximum(warp.dot(toward, vertex.normal), 0)
+        rows, tint = unblocked(scene, vertex.position, toward, FAR, cosine > 0)
+        _collect(light.sun[key], wave, vertex, rows, cosine[rows] * tint)
+
+
+def _add_sky(scene: Scene, wave: Wave, vertex: Vertex, numbers: Numbers, bounce: int, light: Radiance) -> None:
+    """One shadow ray to a bright part of an uneven sky, weighed against leaving the scene by chance."""
+    if scene.model.sky != "fixed" or not scene.sky.uneven:
+        return
+    u = numbers.draw(wave.lane, FIRST_VERTEX + bounce * PER_VERTEX + SKY, 3)
+    toward, radiance, density = scene.sky.sample(u)
+    cosine = np.maximum(warp.dot(toward, vertex.normal), 0)
+    value = radiance * (cosine / (density + cosine / np.float32(np.pi)))
+    rows, tint = unblocked(scene, vertex.position, toward, FAR, cosine > 0)
+    _collect(light.sky[0], wave, vertex, rows, value[:, rows] * tint)
+
+
+def _collect(target: np.ndarray, wave: Wave, vertex: Vertex, rows: np.ndarray, irradiance: np.ndarray) -> None:
+    """Reflect irradiance back along the paths; a lane occurs once, so plain indexing adds it."""
+    reflected = vertex.reflectance[:, rows] * wave.beta[:, rows] * np.float32(1 / np.pi)
+    target[:, wave.lane[rows]] += reflected * irradiance
+
+
+def _scatter(wave: Wave, vertex: Vertex, numbers: Numbers, bounce: int) -> Wave:
+    """Choose the next direction by the cosine, and end dim paths by chance."""
+    beta = wave.beta * vertex.reflectance
+    rows = np.flatnonzero(beta.max(axis=0) > 0)
+    if bounce >= ROULETTE_START:
+        survival = np.minimum(beta.max(axis=0), 1)
+        u = numbers.draw(wave.lane, HASHED + bounce * HASHED_PER_VERTEX + ROULETTE, 1)[0]
+        rows = np.flatnonzero(u < survival)
+        beta /= np.maximum(survival, np.float32(1e-30))
+    u, v = numbers.draw(wave.lane[rows], FIRST_VERTEX + bounce * PER_VERTEX + SCATTER, 2)
+    normal = vertex.normal[:, rows]
+    direction = warp.cosine(u, v, normal)
+    pdf = np.maximum(warp.dot(direction, normal), GRAZING) * np.float32(1 / np.pi)
+    return Wave(wave.lane[rows], vertex.position[:, rows], direction, beta[:, rows], pdf)
+
+
+def sun_direction(toward: np.ndarray, diameter: float, u: tuple[np.ndarray, ...] | None, lanes: int) -> np.ndarray:
+    """Directions to points of the sun's disk.
+
+    Parameters
+    ----------
+    toward : (3,) float32 ndarray
+        Unit vector to its centre.
+    diameter : float
+        Angular diameter [rad]; 0 for a point.
+    u : two (n,) float32 ndarrays, or None
+        Uniform numbers; None for a point.
+    lanes : int
+        n.
+
+    Returns
+    -------
+    (3, n) float32 ndarray
+        Unit vectors.
+    """
+    center = np.broadcast_to(toward[:, None], (3, lanes))
+    if u is None:
+        return center
+    x, y = warp.disk(*u)
+    radius = np.float32(np.tan(diameter / 2))
+    tangent, bitangent = warp.frame(toward[:, None])
+    direction = center + radius * (tangent * x + bitangent * y)
+    return direction / np.sqrt(warp.dot(direction, direction))
+
+
+def unblocked(
+    scene: Scene,
+    position: np.ndarray,
+    toward: np.ndarray,
+    far: np.float32,
+    useful: np.ndarray,
+    shadow: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Which lanes see what they look at, and what transparent surfaces leave of it.
+
+    Parameters
+    ----------
+    scene : Scene
+        What may be in the way.
+    position, toward : (3, n) float32 ndarray
+        Start [m], and the way to the target.
+    far : float32
+        Where to stop, in lengths of `toward`.
+    useful : (n,) bool ndarray
+        Lanes worth a ray.
+    shadow : (n,) bool ndarray, optional
+        Lanes that anything can block; the others always see their target.
+
+    Returns
+    -------
+    rows : (m,) int64 ndarray
+        Lanes that are useful and see their target.
+    tint : (3, m) or (1, 1) float32 ndarray
+        Light that is left; all of it when the scene has nothing transparent.
+    """
+    traced = useful if shadow is None else useful & shadow
+    limit = np.where(traced, far, SKIP)
+    blocked = scene.tracer.blocked(position, np.ascontiguousarray(toward), limit)
+    rows = np.flatnonzero(useful & ~blocked)
+    if not scene.tracer.has_transparent:
+        return rows, np.ones((1, 1), np.float32)
+    return rows, _transmittance(scene, position[:, rows], toward[:, rows], limit[rows])
+
+
+def _transmittance(scene: Scene, position: np.ndarray, toward: np.ndarray, limit: np.ndarray) -> np.ndarray:
+    """(3, n) light that transparent surfaces leave on each segment."""
+    tint = np.ones_like(position)
+    length = np.sqrt(warp.dot(toward, toward))
+    start, left = position.copy(), limit.copy()
+    active = np.flatnonzero(limit > 0)
+    for _ in range(PASS_LIMIT):
+        if not len(active):
+            break
+        hits = scene.tracer.intersect_transparent(start[:, active], toward[:, active], left[active])
+        met = np.flatnonzero(hits.triangle != MISS)
+        active, hits = active[met], _take_hits(hits, met)
+        tint[:, active] *= scene.surfaces.through(hits.triangle, hits.u, hits.v)[0]
+        here = start[:, active] + toward[:, active] * hits.distance
+        step = hits.distance + scene.tracer.offset(here, hits.distance * length[active]) / length[active]
+        start[:, active] += toward[:, active] * step
+        left[active] -= step
+        active = active[(left[active] > 0) & (tint[:, active].max(axis=0) > 0)]
+    tint[:, active] = 0
+    return tint
+
+
+def _transparent_rows(scene: Scene, hits: Hits, rows: np.ndarray) -> np.ndarray:
+    """Those of `rows` that hit something transparent."""
+    triangle = hits.triangle[rows]
+    return rows[(triangle != MISS) & scene.surfaces.transparent[triangle]]
+
+
+def _take_hits(hits: Hits, rows: np.ndarray) -> Hits:
+    return Hits(hits.triangle[rows], hits.distance[rows], hits.u[rows], hits.v[rows], hits.normal[:, rows])
+
+
+def _put_hits(hits: Hits, rows: np.ndarray, new: Hits) -> None:
+    """Overwrite some hits in place."""
+    for name in ("triangle", "distance", "u", "v"):
+        getattr(hits, name)[rows] = getattr(new, name)
+    hits.normal[:, rows] = new.normal

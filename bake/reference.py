@@ -1,0 +1,131 @@
+"""Ground truth: irradiance on surfaces by path tracing, with no voxels between.
+
+Comes in: points and normals in world space. Goes out: the quantity that a bake stores, traced right there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from .gather import Effort, Gathered, SurfacePoints, gather
+from .scene import Model, Scene, prepare
+from .settings import Settings, model
+from .snapshot import LightKind, Snapshot
+from .sobol import scramble
+
+START = 4
+"""Surface points lie on triangles only to float32: rays start this many times the usual offset off them."""
+
+
+def at(
+    scene: Scene,
+    points: np.ndarray,
+    normals: np.ndarray,
+    effort: Effort,
+    progress: Callable[[int], bool] | None = None,
+) -> Gathered:
+    """Trace every modelled transport at surface points.
+
+    Parameters
+    ----------
+    scene : Scene
+        A prepared scene.
+    points : (n, 3) float64 ndarray
+        Points in world space [m].
+    normals : (n, 3) ndarray
+        Unit normals.
+    effort : Effort
+        Samples, bounces, seed.
+    progress : callable, optional
+        As in `gather.gather`.
+
+    Returns
+    -------
+    Gathered
+        With one response: irradiance [W/m2], or as the transport's unit says.
+    """
+    normal = np.ascontiguousarray(np.asarray(normals, np.float32).T)
+    local = np.ascontiguousarray((np.asarray(points, np.float64) - scene.origin).T.astype(np.float32))
+    position = local + normal * (START * scene.tracer.offset(local, np.zeros(local.shape[1], np.float32)))
+    keys = scramble(np.arange(len(points), dtype=np.uint32), 0x5EED)
+    return gather(scene, SurfacePoints(normal), position, keys, effort, progress)
+
+
+def irradiance(
+    snapshot: Snapshot,
+    points: np.ndarray,
+    normals: np.ndarray,
+    transport: str = "all",
+    samples: int = 1024,
+    bounces: int = 8,
+    seed: int = 0,
+    settings: Settings | None = None,
+    threads: int = 0,
+) -> np.ndarray:
+    """Path-trace indirect irradiance at surface points.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+        The scene.
+    points : (n, 3) float64 ndarray
+        Points in world space [m].
+    normals : (n, 3) ndarray
+        Unit normals.
+    transport : str
+        "local", "sky", "sun" (per W/m2 of sun irradiance, of the first sun), or "all", which is their sum with
+        every sun at its own strength.
+    samples, bounces, seed, threads : int
+        As in `Effort`.
+    settings : Settings, optional
+        Sky and sun other than the scene's.
+
+    Returns
+    -------
+    (n, 3) float32 ndarray
+        Irradiance [W/m2]; zeros for light that the scene does not have.
+
+    Notes
+    -----
+    Error: noise that falls with the square root of `samples`, and the energy beyond the bounce limit.
+    """
+    snapshot, light = model(snapshot, settings or Settings())
+    light = Model(
+        local=light.local and transport in ("local", "all"),
+        suns=light.suns if transport in ("sun", "all") else type(light.suns)(),
+        sky=light.sky if transport in ("sky", "all") else "none",
+    )
+    scene = prepare(snapshot, light)
+    found = at(scene, points, normals, Effort(samples, bounces, seed, threads))
+    total = np.zeros((len(points), 3), np.float32)
+    if len(found.local):
+        total += found.local[:, 0]
+    if len(found.sun):
+        total += found.sun[:, 0, 0] if transport == "sun" else combine_suns(snapshot, found.sun[:, :, 0])
+    if len(found.sky):
+        total += found.sky[:, :, 0].sum(axis=1)
+    return total
+
+
+def combine_suns(snapshot: Snapshot, per_key: np.ndarray) -> np.ndarray:
+    """Weigh each sun key by the irradiance of the scene's own sun.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+        The scene; keys other than its suns take the first sun's strength, or 1 W/m2 without one.
+    per_key : (n, keys, 3) float32 ndarray
+        Irradiance per W/m2 of sun.
+
+    Returns
+    -------
+    (n, 3) float32 ndarray
+        Irradiance [W/m2].
+    """
+    lights = snapshot.lights
+    strength = lights.strength[(lights.kind == LightKind.SUN) & (lights.strength > 0).any(axis=1)]
+    if len(strength) != per_key.shape[1]:
+        strength = np.broadcast_to(strength[:1] if len(strength) else np.ones((1, 3)), (per_key.shape[1], 3))
+    return np.einsum("nkc,kc->nc", per_key, strength).astype(np.float32)

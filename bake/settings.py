@@ -1,0 +1,258 @@
+"""What to bake and how well: parsed from the command line's words, said in the bake's own terms.
+
+Comes in: words such as `preview`, `hemisphere`, `0.5`. Goes out: numbers, sun keys, a sky. Wrong words are
+refused with what would be right.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..tree import grid as lattice
+from ..tree.grid import Grid
+from .scene import Model, SunKeys, scene_suns
+from .snapshot import Snapshot, SnapshotError
+
+QUALITIES = {"draft": (64, 6), "preview": (256, 8), "final": (1024, 12)}
+"""(paths per data point, bounces) by name; doubling the paths takes about a third off the noise."""
+
+HEMISPHERE_KEYS = 16
+"""Directions of a free sun."""
+
+
+class SettingsError(ValueError):
+    """A setting that cannot be used; the message names it and says what can."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything besides the scene that a bake's result depends on.
+
+    samples, bounces : paths per data point, and reflections that light may undergo
+    sky : "scene", "harmonics", or three numbers with commas: the radiance of a uniform sky
+    sun : "scene", "none", "hemisphere", "arc:FILE", or a direction to the sun as x,y,z
+    finest : size of the finest voxels [m]; 0 chooses it for the scene
+    seed : another seed gives independent noise
+    """
+
+    samples: int = QUALITIES["preview"][0]
+    bounces: int = QUALITIES["preview"][1]
+    sky: str = "scene"
+    sun: str = "scene"
+    finest: float = 0.0
+    seed: int = 0
+
+
+def with_sky(snapshot: Snapshot, sky: str) -> tuple[Snapshot, str]:
+    """Give the scene the sky that was asked for.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+        The scene.
+    sky : str
+        As in `Settings`.
+
+    Returns
+    -------
+    snapshot : Snapshot
+        With that sky.
+    kind : str
+        "none", "fixed" or "harmonics", as in `Model`.
+
+    Raises
+    ------
+    SettingsError
+        The word is not understood.
+    """
+    if sky == "harmonics":
+        return snapshot, "harmonics"
+    if sky != "scene":
+        radiance = numbers(sky, "--sky", (1, 3))
+        if (radiance < 0).any():
+            raise SettingsError(f"--sky {sky}: radiance cannot be negative")
+        uniform = np.broadcast_to(radiance, (1, 1, 3)).astype(np.float32)
+        snapshot = dataclasses.replace(snapshot, sky=uniform)
+    return snapshot, "fixed" if (snapshot.sky > 0).any() else "none"
+
+
+def sun_keys(snapshot: Snapshot, sun: str) -> SunKeys:
+    """The sun directions that were asked for.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+        The scene; its first sun lends its angular diameter to other directions.
+    sun : str
+        As in `Settings`.
+
+    Returns
+    -------
+    SunKeys
+        Possibly none.
+
+    Raises
+    ------
+    SettingsError
+        The word is not understood, or the file cannot be read.
+    """
+    own = scene_suns(snapshot)
+    if sun == "scene":
+        return own
+    if sun == "none":
+        return SunKeys()
+    if sun == "hemisphere":
+        toward = hemisphere(HEMISPHERE_KEYS)
+    elif sun.startswith("arc:"):
+        toward = _read_arc(Path(sun.removeprefix("arc:")))
+    else:
+        toward = numbers(sun, "--sun", (3,))[None]
+    length = np.linalg.norm(toward, axis=1, keepdims=True)
+    if (length == 0).any():
+        raise SettingsError(f"--sun {sun}: a direction has no length")
+    diameter = own.diameter[0] if len(own.diameter) else 0.0
+    return SunKeys((toward / length).astype(np.float32), np.full(len(toward), diameter, np.float32))
+
+
+def model(snapshot: Snapshot, settings: Settings) -> tuple[Snapshot, Model]:
+    """The scene and the light to bake in it.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+        The scene as it was read.
+    settings : Settings
+        What was asked for.
+
+    Returns
+    -------
+    snapshot : Snapshot
+        With the sky that was asked for.
+    model : Model
+        Which transports to compute.
+    """
+    snapshot, sky = with_sky(snapshot, settings.sky)
+    return snapshot, Model(local=True, suns=sun_keys(snapshot, settings.sun), sky=sky)
+
+
+def hemisphere(count: int) -> np.ndarray:
+    """Directions spread evenly over the upper half of the sphere, the lowest near the horizon.
+
+    Parameters
+    ----------
+    count : int
+        How many.
+
+    Returns
+    -------
+    (count, 3) float64 ndarray
+        Unit vectors, from low to high.
+
+    Notes
+    -----
+    Source: Swinbank and Purser 2006, Fibonacci grid, one half of it.
+    """
+    z = (np.arange(count) + 0.5) / count
+    angle = np.arange(count) * (math.pi * (3 - math.sqrt(5)))
+    radius = np.sqrt(1 - z * z)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
+
+
+def choose_grid(corners: np.ndarray, origin: np.ndarray, finest: float) -> Grid:
+    """Sizes of the voxels.
+
+    Parameters
+    ----------
+    corners : (n, 3, 3) float32 ndarray
+        Triangles relative to the origin [m].
+    origin : (3,) float64 ndarray
+        The snapshot's origin [m].
+    finest : float
+        Size of the finest voxels [m]; 0 chooses it for the scene.
+
+    Returns
+    -------
+    Grid
+        The lattice; its first level is near the size that suits the scene.
+
+    Raises
+    ------
+    SettingsError
+        The size is not a power of two, or far from the scene's own scale.
+    """
+    grid = lattice.choose(corners, origin=tuple(origin))
+    if not finest:
+        return grid
+    if not (math.isfinite(finest) and finest > 0 and math.frexp(finest)[0] == 0.5):
+        raise SettingsError(f"--finest {finest}: use a power of two, such as 0.25, 0.5 or 1")
+    levels = 1 + math.ceil(math.log(grid.first_size / 2 / finest, lattice.BRANCH)) if finest < grid.first_size else 1
+    levels = max(levels, 1)
+    if levels > 5:
+        raise SettingsError(f"--finest {finest}: too fine for a scene whose first level is {grid.first_size} m")
+    return Grid(finest * lattice.BRANCH ** (levels - 1), levels, tuple(origin))
+
+
+def numbers(text: str, option: str, counts: tuple[int, ...]) -> np.ndarray:
+    """Numbers separated by commas.
+
+    Parameters
+    ----------
+    text : str
+        The words after an option.
+    option : str
+        Its name, for the message.
+    counts : tuple of int
+        How many numbers there may be.
+
+    Returns
+    -------
+    (n,) float64 ndarray
+        Finite numbers.
+
+    Raises
+    ------
+    SettingsError
+        They are not numbers, not finite, or too many or too few.
+    """
+    try:
+        values = np.array([float(word) for word in text.split(",")])
+    except ValueError:
+        values = np.zeros(0)
+    if len(values) not in counts or not np.isfinite(values).all():
+        wanted = " or ".join(str(count) for count in counts)
+        raise SettingsError(f"{option} {text}: want {wanted} finite number(s) separated by commas")
+    return values
+
+
+def _read_arc(path: Path) -> np.ndarray:
+    """(n, 3) directions, one line each."""
+    try:
+        text = path.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        raise SettingsError(f"--sun arc:{path}: cannot be read ({error})") from error
+    lines = [",".join(line.replace(",", " ").split()) for line in text.splitlines() if line.strip()]
+    if not lines:
+        raise SettingsError(f"--sun arc:{path}: holds no directions; write one per line as x y z")
+    return np.stack([numbers(line, f"--sun arc:{path}, line", (3,)) for line in lines])
+
+
+def check_scene(snapshot: Snapshot) -> None:
+    """Refuse a scene with nothing to light.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+        The scene.
+
+    Raises
+    ------
+    SnapshotError
+        It has no triangles.
+    """
+    if not len(snapshot.geometry.triangles) or not len(snapshot.geometry.instance_mesh):
+        raise SnapshotError("the scene has no triangles to bake; add a mesh that is visible in renders")

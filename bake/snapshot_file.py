@@ -1,0 +1,280 @@
+"""Snapshots on disk: saved, loaded, checked and hashed.
+
+Comes in: a `Snapshot`. Goes out: one container file, and a digest of everything that light depends on. A
+loaded file is checked like any other untrusted input: every index and every number, before anything uses it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+
+from ..tree import container
+from .snapshot import (
+    Camera,
+    Channel,
+    Geometry,
+    Image,
+    LightKind,
+    Lights,
+    Material,
+    Note,
+    Snapshot,
+    SnapshotError,
+    Texture,
+)
+
+KIND = "snapshot"
+
+GEOMETRY_LAYOUT = {
+    "positions": (np.float32, (None, 3)),
+    "triangles": (np.int32, (None, 3)),
+    "corner_normals": (np.float32, (None, 3, 3)),
+    "corner_uvs": (np.float32, (None, 3, 2)),
+    "corner_colors": (np.float32, (None, 3, 4)),
+    "materials": (np.int32, (None,)),
+    "mesh_first_triangle": (np.int64, (None,)),
+    "instance_mesh": (np.int32, (None,)),
+    "instance_transform": (np.float64, (None, 3, 4)),
+}
+LIGHTS_LAYOUT = {
+    "kind": (np.uint8, (None,)),
+    "position": (np.float64, (None, 3)),
+    "frame": (np.float32, (None, 3, 3)),
+    "strength": (np.float32, (None, 3)),
+    "size": (np.float32, (None, 2)),
+    "spot": (np.float32, (None, 2)),
+    "reflector": (np.bool_, (None,)),
+    "shadow": (np.bool_, (None,)),
+}
+PIXEL_DTYPES = {"srgb": np.uint8, "linear": np.uint8, "float": np.float16}
+
+
+def save(snapshot: Snapshot, path: Path | str) -> int:
+    """Write a snapshot atomically.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+        What to write.
+    path : Path or str
+        File to create or replace.
+
+    Returns
+    -------
+    int
+        Size of the file [bytes].
+
+    Raises
+    ------
+    SnapshotError
+        The snapshot breaks a rule of its own definition.
+    OSError
+        The file cannot be written; nothing is left behind.
+    """
+    check(snapshot)
+    arrays, meta = _to_container(snapshot)
+    return container.write(Path(path), KIND, arrays, meta)
+
+
+def load(path: Path | str) -> Snapshot:
+    """Read a snapshot and check it.
+
+    Parameters
+    ----------
+    path : Path or str
+        A file made by `save`.
+
+    Returns
+    -------
+    Snapshot
+        The scene; its arrays are read-only.
+
+    Raises
+    ------
+    FileError
+        The file is missing, damaged, or not a snapshot.
+    SnapshotError
+        The file is whole, but what it says breaks a rule of the definition.
+    """
+    file = container.read(Path(path), KIND)
+    try:
+        snapshot = _from_container(file.arrays, file.meta)
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise container.FileError(path, 0, f"not a snapshot that this version can read ({error!r})") from error
+    check(snapshot)
+    return snapshot
+
+
+def digest(snapshot: Snapshot) -> str:
+    """Hash everything that a bake depends on: not the cameras, the notes, or where the scene came from.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+        The scene.
+
+    Returns
+    -------
+    str
+        32 hexadecimal digits; equal for equal scenes on every machine.
+    """
+    plain = dataclasses.replace(snapshot, cameras=(), notes=(), source="")
+    arrays, meta = _to_container(plain)
+    state = hashlib.blake2b(json.dumps(meta, sort_keys=True).encode(), digest_size=16)
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        state.update(f"{name}{array.dtype.str}{array.shape}".encode())
+        state.update(array.data)
+    return state.hexdigest()
+
+
+def check(snapshot: Snapshot) -> None:
+    """Verify every rule of the data definition.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+        The scene.
+
+    Raises
+    ------
+    SnapshotError
+        Names the first rule that is broken, and where.
+    """
+    geometry, lights = snapshot.geometry, snapshot.lights
+    _check_layout("geometry", geometry, GEOMETRY_LAYOUT)
+    _check_layout("lights", lights, LIGHTS_LAYOUT)
+    _check_geometry(geometry, len(snapshot.materials))
+    _require(len(lights.names) == len(lights.kind), "lights: one name for each lamp")
+    _require(bool((lights.kind <= max(LightKind)).all()), "lights: kind is not a known shape")
+    _require(bool((lights.strength >= 0).all()), "lights: strength is negative; use a positive power")
+    sky = snapshot.sky
+    _require(sky.ndim == 3 and sky.shape[2] == 3 and sky.size > 0, "sky: shape must be (h, w, 3)")
+    _require(bool(np.isfinite(sky).all() and (sky >= 0).all()), "sky: radiance must be finite and not negative")
+    _require(snapshot.origin.shape == (3,) and bool(np.isfinite(snapshot.origin).all()), "origin: three numbers")
+    for image in snapshot.images:
+        _check_image(image)
+    for material in snapshot.materials:
+        _check_material(material, len(snapshot.images))
+
+
+def _require(condition: bool, message: str) -> None:
+    if not condition:
+        raise SnapshotError(f"snapshot, {message}")
+
+
+def _check_layout(name: str, record, layout: dict) -> None:
+    """Dtype, shape, equal first dimensions of parallel arrays, and finiteness."""
+    for field, (dtype, shape) in layout.items():
+        array = getattr(record, field)
+        fits = array.dtype == dtype and array.ndim == len(shape)
+        fits = fits and all(want in (None, have) for want, have in zip(shape, array.shape, strict=True))
+        _require(fits, f"{name}.{field}: want {np.dtype(dtype).name} {shape}, got {array.dtype} {array.shape}")
+        if array.dtype.kind == "f":
+            _require(bool(np.isfinite(array).all()), f"{name}.{field}: holds NaN or infinity")
+    if name == "lights":
+        rows = {len(getattr(record, field)) for field in layout}
+        _require(len(rows) == 1, "lights: arrays differ in length")
+
+
+def _check_geometry(geometry: Geometry, material_count: int) -> None:
+    rows = len(geometry.triangles)
+    for field in ("corner_normals", "corner_uvs", "corner_colors", "materials"):
+        length = len(getattr(geometry, field))
+        optional = field in ("corner_uvs", "corner_colors") and length == 0
+        _require(optional or length == rows, f"geometry.{field}: {length} rows for {rows} triangles")
+    first = geometry.mesh_first_triangle
+    _require(len(first) > 0 and first[0] == 0 and first[-1] == rows, "geometry.mesh_first_triangle: ends are off")
+    _require(bool((np.diff(first) >= 0).all()), "geometry.mesh_first_triangle: not ascending")
+    instances = len(geometry.instance_mesh)
+    _require(len(geometry.instance_transform) == instances, "geometry.instance_transform: one for each instance")
+    _require(len(geometry.instance_names) == instances, "geometry.instance_names: one for each instance")
+    _check_range("geometry.triangles", geometry.triangles, len(geometry.positions))
+    _check_range("geometry.materials", geometry.materials, material_count)
+    _check_range("geometry.instance_mesh", geometry.instance_mesh, len(first) - 1)
+
+
+def _check_range(name: str, index: np.ndarray, end: int) -> None:
+    inside = index.size == 0 or (index.min() >= 0 and index.max() < end)
+    _require(bool(inside), f"{name}: an index is outside 0..{end - 1}")
+
+
+def _check_image(image: Image) -> None:
+    _require(image.encoding in PIXEL_DTYPES, f"image {image.name!r}: unknown encoding {image.encoding!r}")
+    pixels = image.pixels
+    fits = (
+        pixels.ndim == 3 and pixels.shape[2] == 4 and pixels.size > 0 and pixels.dtype == PIXEL_DTYPES[image.encoding]
+    )
+    _require(fits, f"image {image.name!r}: want (h, w, 4) {np.dtype(PIXEL_DTYPES[image.encoding]).name}")
+    _require(pixels.dtype == np.uint8 or bool(np.isfinite(pixels).all()), f"image {image.name!r}: NaN or infinity")
+
+
+def _check_material(material: Material, image_count: int) -> None:
+    where = f"material {material.name!r}"
+    _require(material.alpha_mode in ("opaque", "mask", "blend"), f"{where}: unknown alpha mode")
+    for field in dataclasses.fields(Material):
+        channel = getattr(material, field.name)
+        if not isinstance(channel, Channel):
+            continue
+        want = 3 if field.name in ("base_color", "emission") else 1
+        _require(len(channel.factor) == want, f"{where}, {field.name}: {want} component(s) expected")
+        finite = all(np.isfinite(value) and value >= 0 for value in channel.factor)
+        _require(finite, f"{where}, {field.name}: must be finite and not negative")
+        if channel.texture is not None:
+            _require(0 <= channel.texture.image < image_count, f"{where}, {field.name}: no such image")
+
+
+def _to_container(snapshot: Snapshot) -> tuple[dict[str, np.ndarray], dict]:
+    arrays = {f"geometry/{name}": getattr(snapshot.geometry, name) for name in GEOMETRY_LAYOUT}
+    arrays |= {f"lights/{name}": getattr(snapshot.lights, name) for name in LIGHTS_LAYOUT}
+    arrays |= {f"image/{i}": image.pixels for i, image in enumerate(snapshot.images)}
+    arrays |= {"sky": snapshot.sky, "origin": snapshot.origin}
+    meta = {
+        "instance_names": list(snapshot.geometry.instance_names),
+        "light_names": list(snapshot.lights.names),
+        "images": [{"name": image.name, "encoding": image.encoding} for image in snapshot.images],
+        "materials": [dataclasses.asdict(material) for material in snapshot.materials],
+        "cameras": [dataclasses.asdict(camera) for camera in snapshot.cameras],
+        "notes": [dataclasses.asdict(note) for note in snapshot.notes],
+        "source": snapshot.source,
+    }
+    return arrays, meta
+
+
+def _from_container(arrays: dict[str, np.ndarray], meta: dict) -> Snapshot:
+    geometry = {name: arrays[f"geometry/{name}"] for name in GEOMETRY_LAYOUT}
+    lights = {name: arrays[f"lights/{name}"] for name in LIGHTS_LAYOUT}
+    images = [Image(entry["name"], arrays[f"image/{i}"], entry["encoding"]) for i, entry in enumerate(meta["images"])]
+    return Snapshot(
+        origin=arrays["origin"],
+        geometry=Geometry(**geometry, instance_names=tuple(meta["instance_names"])),
+        materials=tuple(_material(entry) for entry in meta["materials"]),
+        images=tuple(images),
+        lights=Lights(**lights, names=tuple(meta["light_names"])),
+        sky=arrays["sky"],
+        cameras=tuple(_camera(entry) for entry in meta["cameras"]),
+        notes=tuple(Note(**entry) for entry in meta["notes"]),
+        source=meta["source"],
+    )
+
+
+def _material(entry: dict) -> Material:
+    channels = {name: _channel(value) for name, value in entry.items() if isinstance(value, dict)}
+    return Material(**{**entry, **channels})
+
+
+def _channel(entry: dict) -> Channel:
+    texture = entry["texture"]
+    if texture is not None:
+        texture = Texture(**{**texture, "uv_from_mesh": tuple(float(v) for v in texture["uv_from_mesh"])})
+    return Channel(tuple(float(value) for value in entry["factor"]), texture, bool(entry["vertex_color"]))
+
+
+def _camera(entry: dict) -> Camera:
+    lists = {name: tuple(value) for name, value in entry.items() if isinstance(value, list)}
+    return Camera(**{**entry, **lists})

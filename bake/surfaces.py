@@ -1,0 +1,211 @@
+"""What light finds at a hit: how much is reflected, passed through, emitted.
+
+Comes in: triangle numbers and barycentrics. Goes out: colours, by component. Reflection is diffuse: the
+specular layer's energy is kept, its direction is not, as in every irradiance volume.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .snapshot import Channel, Material, Snapshot
+from .soup import Soup
+from .textures import TexturePool
+
+KULLA_CONTY = (4.08567, 1.00071)
+"""Average Fresnel reflectance of a dielectric is (ior - 1) / (a + b ior) (Kulla and Conty 2017, ior above 1)."""
+
+
+class Surfaces:
+    """The materials of a scene, ready to be evaluated at hits.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+        A checked scene.
+    soup : Soup
+        Its triangles.
+    """
+
+    def __init__(self, snapshot: Snapshot, soup: Soup) -> None:
+        geometry, materials = snapshot.geometry, snapshot.materials
+        self.material = geometry.materials[soup.source]
+        self._uvs = _corner_values(geometry.corner_uvs, soup)
+        self._colors = _corner_values(geometry.corner_colors, soup)
+        names = ("base_color", "emission", "alpha", "metallic", "transmission")
+        channels = {name: [getattr(material, name) for material in materials] for name in names}
+        textures = tuple({c.texture: None for row in channels.values() for c in row if c.texture is not None})
+        pool = TexturePool(snapshot.images, textures)
+        self._channel = {name: _ChannelTable(row, textures, pool) for name, row in channels.items()}
+        self._fresnel = np.array([average_fresnel(m.ior, m.specular_level) for m in materials], np.float32)
+        self._cutoff = np.array([m.alpha_cutoff if m.alpha_mode == "mask" else -1 for m in materials], np.float32)
+        self._opaque_alpha = np.array([m.alpha_mode == "opaque" for m in materials], bool)
+        self.transparent = np.array([_lets_light_pass(m) for m in materials], bool)[self.material]
+        self.emissive = np.array([max(m.emission.factor) > 0 for m in materials], bool)[self.material]
+
+    def reflectance(self, triangle: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Diffuse reflectance that holds all reflected energy of an opaque surface.
+
+        Parameters
+        ----------
+        triangle : (n,) int ndarray
+            Hits.
+        u, v : (n,) float32 ndarray
+            Their barycentric coordinates.
+
+        Returns
+        -------
+        (3, n) float32 ndarray
+            In [0, 1].
+
+        Notes
+        -----
+        Source: energy balance of the Principled shader's lobes: metal reflects the base colour; a dielectric
+        reflects its average Fresnel term F white, and (1 - F)(1 - transmission) of the base colour.
+        """
+        material = self.material[triangle]
+        base, metallic, transmission = self._base_layers(material, triangle, u, v)
+        fresnel = self._fresnel[material]
+        diffuse = metallic + (1 - metallic) * (1 - fresnel) * (1 - transmission)
+        return np.minimum(base * diffuse + (1 - metallic) * fresnel, 1)
+
+    def through(self, triangle: np.ndarray, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Light that goes straight on, and how much of the surface is there.
+
+        Parameters
+        ----------
+        triangle : (n,) int ndarray
+            Hits.
+        u, v : (n,) float32 ndarray
+            Their barycentric coordinates.
+
+        Returns
+        -------
+        passed : (3, n) float32 ndarray
+            Fraction of light that passes: the uncovered part, and transmission tinted by the base colour.
+        covered : (n,) float32 ndarray
+            Alpha: what reflection and emission are multiplied with.
+        """
+        material = self.material[triangle]
+        covered = self._coverage(material, triangle, u, v)
+        base, metallic, transmission = self._base_layers(material, triangle, u, v)
+        clear = covered * (1 - metallic) * (1 - self._fresnel[material]) * transmission
+        return np.minimum(1 - covered + clear * base, 1), covered
+
+    def emission(self, triangle: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Radiance that surfaces emit, on both sides.
+
+        Parameters
+        ----------
+        triangle : (n,) int ndarray
+            Hits.
+        u, v : (n,) float32 ndarray
+            Their barycentric coordinates.
+
+        Returns
+        -------
+        (3, n) float32 ndarray
+            Radiance [W/(m2 sr)].
+        """
+        material = self.material[triangle]
+        return self._evaluate("emission", material, triangle, u, v)
+
+    def _base_layers(self, material, triangle, u, v) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Base colour, metallic, transmission."""
+        base = np.minimum(self._evaluate("base_color", material, triangle, u, v), 1)
+        metallic = np.minimum(self._evaluate("metallic", material, triangle, u, v)[0], 1)
+        transmission = np.minimum(self._evaluate("transmission", material, triangle, u, v)[0], 1)
+        return base, metallic, transmission
+
+    def _coverage(self, material, triangle, u, v) -> np.ndarray:
+        """Alpha after the material's mode: opaque, cut, or as it is."""
+        alpha = np.minimum(self._evaluate("alpha", material, triangle, u, v)[0], 1)
+        cutoff = self._cutoff[material]
+        alpha = np.where(cutoff >= 0, (alpha >= cutoff).astype(np.float32), alpha)
+        return np.where(self._opaque_alpha[material], np.float32(1), alpha)
+
+    def _evaluate(self, name: str, material, triangle, u, v) -> np.ndarray:
+        """(k, n) values of one channel."""
+        table = self._channel[name]
+        value = table.factor[:, material]
+        if table.has_texture:
+            lanes = np.flatnonzero(table.texture[material] >= 0)
+            if len(lanes):
+                uv = _interpolate(self._uvs, triangle[lanes], u[lanes], v[lanes])
+                value[:, lanes] *= table.sample(material[lanes], uv)
+        if table.has_color:
+            lanes = np.flatnonzero(table.color[material])
+            rgba = _interpolate(self._colors, triangle[lanes], u[lanes], v[lanes])
+            value[:, lanes] *= rgba[:3] if len(value) == 3 else rgba[3:]
+        return value
+
+
+class _ChannelTable:
+    """One input of every material, as arrays over materials."""
+
+    def __init__(self, channels: list[Channel], textures: tuple, pool: TexturePool) -> None:
+        self.factor = np.ascontiguousarray(np.array([c.factor for c in channels], np.float32).T)
+        self.texture = np.array([-1 if c.texture is None else textures.index(c.texture) for c in channels], np.int64)
+        self.color = np.array([c.vertex_color for c in channels], bool)
+        self.has_texture = bool((self.texture >= 0).any())
+        self.has_color = bool(self.color.any())
+        self._source = np.array([-1 if c.texture is None else "rgba".find(c.texture.channel) for c in channels])
+        self._pool = pool
+
+    def sample(self, material: np.ndarray, uv: np.ndarray) -> np.ndarray:
+        """(k, n) texture values in the channel that each material asks for."""
+        rgba = self._pool.sample(self.texture[material], uv)
+        color = rgba[:3] if len(self.factor) == 3 else rgba[:3].mean(axis=0, keepdims=True)
+        source = self._source[material]
+        single = source >= 0
+        if single.any():
+            picked = np.take_along_axis(rgba, np.maximum(source, 0)[None], axis=0)
+            color = np.where(single, picked, color)
+        return color
+
+
+def average_fresnel(ior: float, specular_level: float) -> float:
+    """Share of diffuse light that a dielectric's surface reflects.
+
+    Parameters
+    ----------
+    ior : float
+        Index of refraction, at least 1.
+    specular_level : float
+        Blender's scale of the reflectance at normal incidence; 0.5 leaves it as it is, 0 removes the layer.
+
+    Returns
+    -------
+    float
+        Cosine-weighted average of Fresnel's equations over the hemisphere.
+
+    Notes
+    -----
+    Source: Kulla and Conty 2017, fit of the average Fresnel term; the level changes the index of refraction
+    the way Blender's Principled shader does.
+    """
+    normal_incidence = ((ior - 1) / (ior + 1)) ** 2 * 2 * specular_level
+    root = np.sqrt(min(normal_incidence, 0.99))
+    effective = (1 + root) / (1 - root)
+    a, b = KULLA_CONTY
+    return float((effective - 1) / (a + b * effective))
+
+
+def _lets_light_pass(material: Material) -> bool:
+    """Whether any light can go straight through the surface."""
+    return material.alpha_mode != "opaque" or material.transmission.factor[0] > 0
+
+
+def _corner_values(values: np.ndarray, soup: Soup) -> np.ndarray:
+    """(n, 3, k) corner attributes in the corner order of the soup, or no rows when the scene has none."""
+    if not len(values):
+        return values
+    return np.take_along_axis(values[soup.source], soup.corner_order[:, :, None].astype(np.int64), axis=1)
+
+
+def _interpolate(corners: np.ndarray, triangle: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """(k, n) attributes at barycentric coordinates; ones where the scene has no such attribute."""
+    if not len(corners):
+        return np.ones((corners.shape[2], len(triangle)), np.float32)
+    value = corners[triangle]
+    return (value[:, 0].T * (1 - u - v)) + value[:, 1].T * u + value[:, 2].T * v
