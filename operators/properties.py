@@ -49,7 +49,7 @@ class GIVOLUMES_PG_scene(bpy.types.PropertyGroup):
     )
     finest: FloatProperty(
         name="Finest Voxel",
-        description="Size of the smallest voxels, in metres (0.5 by default); scaled with very small and very large scenes",
+        description="Size of the smallest voxels, in metres (0.5 by default); scaled in very small or large scenes",
         default=0.5,
         min=0.001,
         soft_max=2.0,
