@@ -59,7 +59,11 @@ class GIVOLUMES_OT_bake(bpy.types.Operator):
             return {"RUNNING_MODAL"}
         if event.type != "TIMER":
             return {"RUNNING_MODAL", "PASS_THROUGH"}
-        progress = next(self._steps, None)
+        try:
+            progress = next(self._steps, None)
+        except Exception:  # a defect of ours: leave the window usable, then let Blender show it
+            self._finish(context)
+            raise
         if progress is None:
             return self._finish(context)
         if progress != self._shown:
@@ -77,13 +81,16 @@ class GIVOLUMES_OT_bake(bpy.types.Operator):
     def _run_to_end(self, started):
         """For scripts: progress to standard error, once per stage."""
         stage = None
-        with interrupts(started.stop):
-            for progress in self._steps:
-                if progress.stage != stage:
-                    stage = progress.stage
-                    print(f"GI Volumes: {stage}", file=sys.stderr)
-                time.sleep(TICK_S / 2)
-        return self._tell(job.end())
+        try:
+            with interrupts(started.stop):
+                for progress in self._steps:
+                    if progress.stage != stage:
+                        stage = progress.stage
+                        print(f"GI Volumes: {stage}", file=sys.stderr)
+                    time.sleep(TICK_S / 2)
+        finally:
+            outcome = job.end()
+        return self._tell(outcome)
 
     def _finish(self, context):
         """Leave the window as it was."""

@@ -1,0 +1,30 @@
+"""What Blender is given when the extension is enabled, and takes back when it is disabled."""
+
+from __future__ import annotations
+
+import bpy
+
+from . import bake_operator, clear_operator, command, job, panels, properties
+
+CLASSES = (*properties.CLASSES, *bake_operator.CLASSES, *clear_operator.CLASSES, *panels.CLASSES)
+
+_register_classes, _unregister_classes = bpy.utils.register_classes_factory(CLASSES)
+_commands: list[object] = []
+
+
+def register() -> None:
+    """Add classes, properties and the command."""
+    _register_classes()
+    properties.attach()
+    _commands.append(bpy.utils.register_cli_command(command.NAME, command.main))
+
+
+def unregister() -> None:
+    """Stop a bake that runs and remove everything."""
+    if job.current is not None:
+        job.current.abandon()
+        job.end()
+    while _commands:
+        bpy.utils.unregister_cli_command(_commands.pop())
+    properties.detach()
+    _unregister_classes()
