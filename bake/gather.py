@@ -121,7 +121,7 @@ class Gathered:
     sky: np.ndarray
 
 
-class Cancelled(Exception):
+class CancelledError(Exception):
     """The caller asked to stop; nothing of the unfinished points is kept."""
 
 
@@ -157,7 +157,7 @@ def gather(
 
     Raises
     ------
-    Cancelled
+    CancelledError
         `progress` returned False.
     """
     count = position.shape[1]
@@ -174,8 +174,10 @@ def gather(
         tile = _gather_tile(scene, sensor, position[:, rows], rows, keys[rows], effort)
         if scene.has_local:
             out.local[rows] = tile[:, 0]
-        out.sun[rows] = tile[:, 1 : 1 + suns] if suns else out.sun[rows]
-        out.sky[rows] = tile[:, 1 + suns :] if functions else out.sky[rows]
+        if suns:
+            out.sun[rows] = tile[:, 1 : 1 + suns]
+        if functions:
+            out.sky[rows] = tile[:, 1 + suns :]
         return len(rows)
 
     size = max(1, TILE_LANES // min(effort.samples, BLOCK_SAMPLES))
@@ -205,7 +207,7 @@ def run_tiles(
 
     Raises
     ------
-    Cancelled
+    CancelledError
         `progress` returned False; tiles that run are finished, the others never start.
     """
     done = 0
@@ -216,7 +218,7 @@ def run_tiles(
                 finished, pending = wait(pending, return_when=FIRST_COMPLETED)
                 done += sum(future.result() for future in finished)
                 if progress is not None and not progress(done):
-                    raise Cancelled
+                    raise CancelledError
         except BaseException:
             pool.shutdown(wait=True, cancel_futures=True)
             raise
@@ -268,12 +270,12 @@ def _direct(scene: Scene, sensor: Sensor, position, rows, numbers: Numbers, lane
     functions_start = 1 + len(scene.model.suns.toward)
     if scene.model.local and scene.reflectors.count:
         sample = scene.reflectors.sample(position, None, numbers.draw(lanes, DIRECT_DIMENSIONS, 4))
-        direction, length = _unit(sample.toward)
+        direction = _unit(sample.toward)
         seen = (position, sample.toward, TARGET_SHORTENED, sample.irradiance.any(axis=0), sample.shadow)
         yield 0, direction, _visible(scene, sample.irradiance, *seen)
     if scene.model.local and scene.emitters.count:
         toward, radiance, density = scene.emitters.sample(position, numbers.draw(lanes, DIRECT_DIMENSIONS + 4, 3))
-        direction, length = _unit(toward)
+        direction = _unit(toward)
         value = radiance / (density + sensor.pdf(rows, direction))
         yield 0, direction, _visible(scene, value, position, toward, TARGET_SHORTENED, density > 0)
     if scene.model.sky == "fixed" and scene.sky.uneven:
@@ -290,10 +292,9 @@ def _visible(scene: Scene, value: np.ndarray, position, toward, far, useful, sha
     return out
 
 
-def _unit(vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(unit vectors, lengths)."""
-    length = np.maximum(np.sqrt(warp.dot(vector, vector)), np.float32(1e-30))
-    return vector / length, length
+def _unit(vector: np.ndarray) -> np.ndarray:
+    """(3, n) unit vectors."""
+    return vector / np.maximum(np.sqrt(warp.dot(vector, vector)), np.float32(1e-30))
 
 
 def _seeded(keys: np.ndarray, seed: int) -> np.ndarray:

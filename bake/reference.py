@@ -95,18 +95,50 @@ def irradiance(
     light = Model(
         local=light.local and transport in ("local", "all"),
         suns=light.suns if transport in ("sun", "all") else type(light.suns)(),
-        sky=light.sky if transport in ("sky", "all") else "none",
+        sky=_folded(snapshot) if transport in ("sky", "all") else "none",
     )
     scene = prepare(snapshot, light)
     found = at(scene, points, normals, Effort(samples, bounces, seed, threads))
-    total = np.zeros((len(points), 3), np.float32)
-    if len(found.local):
-        total += found.local[:, 0]
-    if len(found.sun):
-        total += found.sun[:, 0, 0] if transport == "sun" else combine_suns(snapshot, found.sun[:, :, 0])
-    if len(found.sky):
-        total += found.sky[:, :, 0].sum(axis=1)
-    return total
+    if not (scene.has_local or len(light.suns.toward) or light.sky_count):
+        return np.zeros((len(points), 3), np.float32)
+    return total(snapshot, scene, found, transport)
+
+
+def total(snapshot: Snapshot, scene: Scene, found: Gathered, transport: str) -> np.ndarray:
+    """Combine what was gathered into the irradiance that a transport's name stands for.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+        The scene, for the strength of its suns.
+    scene : Scene
+        Its sky weighs the responses to harmonics.
+    found : Gathered
+        With one response.
+    transport : str
+        As in `irradiance`.
+
+    Returns
+    -------
+    (n, 3) float32 ndarray
+        Irradiance [W/m2], or per W/m2 of sun irradiance for "sun".
+    """
+    count = max(len(found.local), len(found.sun), len(found.sky))
+    out = np.zeros((count, 3), np.float32)
+    if transport in ("local", "all") and len(found.local):
+        out += found.local[:, 0]
+    if transport in ("sun", "all") and len(found.sun):
+        out += found.sun[:, 0, 0] if transport == "sun" else combine_suns(snapshot, found.sun[:, :, 0])
+    if transport in ("sky", "all") and len(found.sky):
+        response = found.sky[:, :, 0]
+        weights = scene.sky.harmonics() if scene.model.sky == "harmonics" else np.ones((1, 3))
+        out += np.einsum("nkc,kc->nc", response, weights).astype(np.float32)
+    return out
+
+
+def _folded(snapshot: Snapshot) -> str:
+    """The sky as one value: the truth needs no basis."""
+    return "fixed" if (snapshot.sky > 0).any() else "none"
 
 
 def combine_suns(snapshot: Snapshot, per_key: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..tree import harmonics
 from .lamps import LUMINANCE
 
 UNEVEN = 8.0
@@ -95,6 +96,23 @@ class Sky:
         radius = np.sqrt(np.maximum(0, 1 - z * z))
         direction = np.stack([radius * np.cos(angle), radius * np.sin(angle), z]).astype(np.float32)
         return direction, self._texels[:, texel], self._pdf[texel]
+
+    def harmonics(self) -> np.ndarray:
+        """Project the map onto the nine real harmonics.
+
+        Returns
+        -------
+        (9, 3) float64 ndarray
+            Radiance coefficients [W/(m2 sr)]; texels count at their centres.
+        """
+        z = (self._edges[1:] + self._edges[:-1]) / 2
+        angle = (0.5 - (np.arange(self._width) + 0.5) / self._width) * 2 * np.pi
+        radius = np.sqrt(1 - z * z)[:, None]
+        shape = (self._height, self._width)
+        parts = (radius * np.cos(angle), radius * np.sin(angle), np.broadcast_to(z[:, None], shape))
+        values = harmonics.basis(np.stack(parts, axis=-1)).reshape(-1, harmonics.COUNT).astype(np.float64)
+        solid_angle = np.repeat(np.diff(self._edges), self._width) * (2 * np.pi / self._width)
+        return values.T @ (self._texels * solid_angle).T
 
     def _texel(self, direction: np.ndarray) -> np.ndarray:
         """Which texel a direction falls in; rows are equal angles of elevation."""

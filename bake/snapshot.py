@@ -1,8 +1,8 @@
 """A scene as plain arrays: the only thing that crosses from Blender to the bake.
 
-Comes in: arrays read from a scene by `operators/`. Goes out: one immutable record (`snapshot_file` saves,
-loads, checks and hashes it). Meshes are stored once and placed by instances, in double precision, so that a scene far from
-the world origin keeps its detail. Units: metres, radiance W/(m2 sr), linear Rec.709, z up, right-handed.
+Comes in: arrays read from a scene by `operators/`. Goes out: one immutable record (`snapshot_file` saves, loads,
+checks and hashes it). Meshes are stored once and placed by instances, in double precision, so that a scene far
+from the world origin keeps its detail. Units: metres, radiance W/(m2 sr), linear Rec.709, z up, right-handed.
 """
 
 from __future__ import annotations

@@ -1,0 +1,293 @@
+"""The one unit of work: bake cells of a snapshot into a folder.
+
+Comes in: a snapshot, settings, which cells. Goes out: one set of files per cell, and the folder's `world.json`.
+Cells whose files are whole and were made from the same input are kept as they are, so the command can be run
+again, by anybody, after anything. Each cell's files appear at once or not at all.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ..tree import build, folder
+from ..tree.grid import Grid
+from ..tree.topology import Topology
+from . import datapoints, snapshot_file
+from .gather import CancelledError, DataPoints, Effort, Gathered, gather
+from .progress import Progress
+from .scene import Model, Scene, prepare, scene_suns
+from .settings import Settings, SettingsError, check_scene, choose_grid, model
+from .snapshot import LightKind, Snapshot
+
+SNAPSHOT_NAME = "scene.giv"
+"""The snapshot inside a bake's folder."""
+
+FORMAT = "gi_volumes bake 1"
+"""Part of every bake's hash: files of another definition are baked anew."""
+
+
+@dataclass
+class Outcome:
+    """What a bake did, as the command line's JSON object."""
+
+    triangles: int = 0
+    cells: int = 0
+    data_points: int = 0
+    bytes: dict[str, int] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    rays: int = 0
+    modelled: list[str] = field(default_factory=list)
+    left_out: list[dict[str, str]] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+
+def bake(
+    snapshot: Snapshot,
+    target: Path,
+    settings: Settings,
+    cells: list[tuple[int, int]] | None = None,
+    threads: int = 0,
+    progress: Progress | None = None,
+) -> Outcome:
+    """Bake some or all cells of a scene.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+        A checked scene.
+    target : Path
+        Folder of the bake; it is made if needed.
+    settings : Settings
+        What to bake and how well.
+    cells : list of (i, j), optional
+        Only these world cells.
+    threads : int
+        Worker threads; 0 uses every core.
+    progress : Progress, optional
+        Where to say how far it is.
+
+    Returns
+    -------
+    Outcome
+        Counts, sizes, times, what was modelled and what was left out.
+
+    Raises
+    ------
+    SnapshotError, SettingsError
+        The scene or a setting cannot be baked.
+    OSError
+        The folder cannot be written.
+    KeyboardInterrupt
+        The user stopped it; finished cells are kept and listed.
+    """
+    progress = progress or Progress()
+    check_scene(snapshot)
+    progress.stage("Preparing")
+    snapshot, light = model(snapshot, settings)
+    identity = bake_hash(snapshot, settings, light)
+    scene = prepare(snapshot, light)
+    grid = choose_grid(scene.soup.corners, snapshot.origin, settings.finest)
+    header = _header(snapshot, settings, light, scene, grid, identity)
+    target.mkdir(parents=True, exist_ok=True)
+    snapshot_file.save(snapshot, target / SNAPSHOT_NAME)
+    trees = _build_trees(scene, grid, cells, progress)
+    outcome = _describe(snapshot, light, scene, trees)
+    try:
+        _bake_cells(scene, grid, trees, target, settings, threads, identity, progress)
+    finally:
+        folder.assemble(target, header)
+    outcome.seconds = progress.seconds
+    outcome.rays = scene.tracer.rays
+    outcome.bytes = _file_sizes(target)
+    return outcome
+
+
+def bake_hash(snapshot: Snapshot, settings: Settings, light: Model) -> str:
+    """Identify everything that a cell's values depend on.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+        The scene, with the sky that is baked.
+    settings : Settings
+        How it is baked; the words for sun and sky count by what they mean.
+    light : Model
+        What is baked.
+
+    Returns
+    -------
+    str
+        32 hexadecimal digits.
+    """
+    words = dataclasses.asdict(settings) | {"sun": light.suns.toward.tolist(), "sky": light.sky}
+    text = json.dumps([FORMAT, snapshot_file.digest(snapshot), words, light.suns.diameter.tolist()], sort_keys=True)
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+def _build_trees(scene: Scene, grid: Grid, cells, progress: Progress) -> list[Topology]:
+    """The voxel tree of every cell that holds geometry."""
+    occupied = [tuple(int(v) for v in cell) for cell in grid.cells_of(scene.soup.bounds)]
+    wanted = occupied if cells is None else cells
+    progress.stage("Building trees", len(wanted))
+    trees = []
+    for number, cell in enumerate(wanted):
+        tree = build.build(scene.soup.corners, grid, cell)
+        if tree is not None:
+            trees.append(tree)
+        elif cells is not None:
+            raise SettingsError(f"--cells {cell[0]},{cell[1]}: no geometry there; cells {_list(occupied)}")
+        progress.show(number + 1)
+    return trees
+
+
+def _bake_cells(scene, grid, trees: list[Topology], target, settings, threads, identity, progress: Progress) -> None:
+    """Cell after cell; the ones already there are only counted."""
+    total = sum(tree.size for tree in trees)
+    done = 0
+    progress.stage("Baking", total)
+    for tree in trees:
+        if not folder.has_cell(target, tree.cell, identity):
+            _bake_cell(scene, grid, tree, target, settings, threads, identity, lambda n, d=done: progress.show(d + n))
+        done += tree.size
+        progress.show(done)
+
+
+def _bake_cell(scene, grid: Grid, tree: Topology, target, settings: Settings, threads, identity, show) -> None:
+    """Place the data points of one cell, gather their light, write its files."""
+    level, coords = tree.voxels()
+    size = np.asarray(grid.voxel_size(level.astype(np.int64)), np.float64)
+    key = datapoints.keys(level, coords)
+    placed = datapoints.place(scene, grid.centers(level, coords), size, key, threads)
+    rows = np.flatnonzero(placed.valid)
+    order = rows[morton_order(placed.position[:, rows])]
+    effort = Effort(settings.samples, settings.bounces, settings.seed, threads)
+    position = np.ascontiguousarray(placed.position[:, order])
+    found = gather(scene, DataPoints(), position, key[order], effort, show)
+    payloads = {name: _spread(values, order, tree.size) for name, values in _payloads(found)}
+    folder.write_cell(target, tree, payloads, placed.valid, placed.offset, {"bake": identity})
+
+
+def _payloads(found: Gathered):
+    """(name, (points, functions, 9, 3) values) of each transport that is modelled."""
+    if len(found.local):
+        yield "local", found.local[:, None]
+    if len(found.sun):
+        yield "sun", found.sun
+    if len(found.sky):
+        yield "sky", found.sky
+
+
+def _spread(values: np.ndarray, rows: np.ndarray, size: int) -> np.ndarray:
+    """Values of the valid points at their places in the index space; zeros elsewhere."""
+    out = np.zeros((size, *values.shape[1:]), np.float32)
+    out[rows] = values
+    return out
+
+
+def morton_order(position: np.ndarray) -> np.ndarray:
+    """Order points along a space-filling curve, so that a tile's rays stay together.
+
+    Parameters
+    ----------
+    position : (3, n) float32 ndarray
+        Points.
+
+    Returns
+    -------
+    (n,) int64 ndarray
+        Rows, sorted by 30-bit Morton code.
+    """
+    if position.shape[1] == 0:
+        return np.zeros(0, np.int64)
+    low = position.min(axis=1, keepdims=True)
+    step = max(float(np.ptp(position, axis=1).max()), 1e-30) / 1023
+    code = np.zeros(position.shape[1], np.int64)
+    lattice = ((position - low) / step).astype(np.int64)
+    for bit in range(10):
+        for axis in range(3):
+            code |= (lattice[axis] >> bit & 1) << (3 * bit + axis)
+    return np.argsort(code, kind="stable")
+
+
+def _header(snapshot: Snapshot, settings: Settings, light: Model, scene: Scene, grid: Grid, identity: str) -> dict:
+    """What `world.json` says besides the cells."""
+    transports: dict[str, dict] = {}
+    if scene.has_local:
+        transports["local"] = {"unit": "W/m2"}
+    if len(light.suns.toward):
+        transports["sun"] = _sun_header(snapshot, light)
+    if light.sky != "none":
+        transports["sky"] = {"kind": light.sky, "unit": "W/m2"}
+    if light.sky == "harmonics":
+        transports["sky"] |= {"unit": "sr", "radiance": scene.sky.harmonics().tolist()}
+    expected = [[int(v) for v in cell] for cell in grid.cells_of(scene.soup.bounds)]
+    return {
+        "bake": identity,
+        "snapshot": snapshot_file.digest(snapshot),
+        "source": snapshot.source,
+        "settings": dataclasses.asdict(settings),
+        "grid": grid,
+        "transports": transports,
+        "expected_cells": expected,
+    }
+
+
+def _sun_header(snapshot: Snapshot, light: Model) -> dict:
+    """Key directions, and the suns that shine when nobody says otherwise."""
+    own = scene_suns(snapshot)
+    lights = snapshot.lights
+    rows = (lights.kind == LightKind.SUN) & (lights.strength > 0).any(axis=1)
+    return {
+        "unit": "1, irradiance per W/m2 of sun on a surface facing it",
+        "directions": light.suns.toward.tolist(),
+        "diameters": light.suns.diameter.tolist(),
+        "scene": [
+            {"direction": direction.tolist(), "irradiance": strength.tolist()}
+            for direction, strength in zip(own.toward, lights.strength[rows], strict=True)
+        ],
+    }
+
+
+def _describe(snapshot: Snapshot, light: Model, scene: Scene, trees: list[Topology]) -> Outcome:
+    """Counts, what was modelled, and what was left out and why."""
+    outcome = Outcome(len(scene.soup.corners), len(trees), sum(tree.size for tree in trees))
+    parts = {
+        "local": (scene.has_local, "the scene has no lamps and no emissive surfaces"),
+        "sun": (len(light.suns.toward) > 0, "there is no sun"),
+        "sky": (light.sky != "none", "the sky is black"),
+        "probes": (False, "specular probes are not baked by this version"),
+    }
+    for name, (present, why) in parts.items():
+        if present:
+            outcome.modelled.append(name)
+        else:
+            outcome.left_out.append({"what": name, "why": why})
+    skipped = sum(tree.left_out for tree in trees)
+    if skipped:
+        why = "a world cell holds at most 65,535 data points; the neediest voxels were refined"
+        outcome.left_out.append({"what": f"{skipped} voxels", "why": why})
+    outcome.left_out += [{"what": note.what, "why": note.why} for note in snapshot.notes]
+    return outcome
+
+
+def _file_sizes(target: Path) -> dict[str, int]:
+    """Bytes on disk by kind."""
+    sizes = dict.fromkeys(("tree", "local", "sun", "sky", "points", "probes"), 0)
+    for entry in folder.load_header(target)["cells"]:
+        for name, file in entry["files"].items():
+            sizes[name] += int(file["bytes"])
+    return sizes
+
+
+def _list(cells) -> str:
+    """Cells as the command line writes them."""
+    return "/".join(f"{i},{j}" for i, j in cells)
+
+
+__all__ = ["CancelledError", "Outcome", "bake", "bake_hash", "morton_order"]

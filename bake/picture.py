@@ -1,0 +1,110 @@
+"""Pictures for people: two irradiance images side by side and their signed difference.
+
+Comes in: linear images. Goes out: a PNG to look at, or an OpenEXR file with every number.
+"""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+from ..tree.atomic import write_bytes_atomically
+from .lamps import LUMINANCE
+from .settings import SettingsError
+
+BRIGHT = 0.9
+"""Display value of the brightest pixels that count, those at the quantile below."""
+
+QUANTILE = 0.97
+
+DIFFERENCE_RANGE = 0.5
+"""Difference over the image's mean at which red or blue is full."""
+
+BACKGROUND = (24, 24, 28)
+CAPTION_HEIGHT = 18
+CAPTIONS = ("baked", "path traced", "difference, red: baked is brighter, full at 50 % of the mean")
+
+
+def write_pictures(path: Path, baked: np.ndarray, traced: np.ndarray, covered: np.ndarray) -> None:
+    """Write the comparison.
+
+    Parameters
+    ----------
+    path : Path
+        .png: three pictures beside each other; .exr: layers `baked`, `traced`, `difference`.
+    baked, traced : (h, w, 3) float32 ndarray
+        Linear Rec.709 [W/m2].
+    covered : (h, w) float32 ndarray
+        1 where there is a surface.
+
+    Raises
+    ------
+    SettingsError
+        Another kind of file.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".exr":
+        _write_exr(path, {"baked": baked, "traced": traced, "difference": baked - traced})
+    elif suffix == ".png":
+        _write_png(path, baked, traced, covered > 0)
+    else:
+        raise SettingsError(f"{path}: write pictures as .png or .exr")
+
+
+def _write_png(path: Path, baked: np.ndarray, traced: np.ndarray, covered: np.ndarray) -> None:
+    from PIL import Image, ImageDraw
+
+    seen = (traced @ LUMINANCE)[covered]
+    bright = float(np.quantile(seen, QUANTILE)) if seen.size else 1.0
+    mean = float(seen.mean()) if seen.size else 1.0
+    scale = BRIGHT / max(bright, 1e-30)
+    panels = [
+        _display(baked * scale),
+        _display(traced * scale),
+        _signed((baked - traced) @ LUMINANCE / max(mean, 1e-30)),
+    ]
+    height, width = covered.shape
+    sheet = np.full((height + CAPTION_HEIGHT, 3 * width, 3), BACKGROUND, np.uint8)
+    for number, panel in enumerate(panels):
+        sheet[CAPTION_HEIGHT:, number * width : (number + 1) * width][covered] = panel[covered]
+    image = Image.fromarray(sheet)
+    draw = ImageDraw.Draw(image)
+    for number, caption in enumerate(CAPTIONS):
+        draw.text((number * width + 4, 3), caption, fill=(220, 220, 220))
+    buffer = io.BytesIO()
+    image.save(buffer, "PNG")
+    write_bytes_atomically(path, buffer.getvalue())
+
+
+def _display(linear: np.ndarray) -> np.ndarray:
+    """(h, w, 3) uint8, sRGB curve (IEC 61966-2-1)."""
+    value = np.clip(linear, 0, 1)
+    encoded = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
+    return np.round(encoded * 255).astype(np.uint8)
+
+
+def _signed(relative: np.ndarray) -> np.ndarray:
+    """(h, w, 3) uint8: white where equal, red above, blue below."""
+    share = np.clip(relative / DIFFERENCE_RANGE, -1, 1)
+    fade = 1 - np.abs(share)
+    red, blue = np.where(share >= 0, 1, fade), np.where(share <= 0, 1, fade)
+    return np.round(np.stack([red, fade, blue], axis=-1) * 255).astype(np.uint8)
+
+
+def _write_exr(path: Path, layers: dict[str, np.ndarray]) -> None:
+    import OpenEXR
+
+    channels = {
+        f"{name}.{letter}": np.ascontiguousarray(layer[..., number])
+        for name, layer in layers.items()
+        for number, letter in enumerate("RGB")
+    }
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    scratch = path.with_name(path.name + ".part")
+    try:
+        OpenEXR.File(header, channels).write(str(scratch))
+        scratch.replace(path)
+    finally:
+        scratch.unlink(missing_ok=True)
