@@ -109,9 +109,6 @@ def _stop_like_ctrl_c() -> None:
             signal.signal(getattr(signal, name), signal.default_int_handler)
 
 
-# Worker processes of a pool import this file again and look for the package's modules by name.
-package()
-
 if __name__ == "__main__":
     _stop_like_ctrl_c()
     sys.exit(main(sys.argv[1:]))

@@ -102,8 +102,10 @@ class GIVOLUMES_OT_bake(bpy.types.Operator):
         return outcome
 
     def _tell(self, outcome):
-        """One report for the end, one for what was represented otherwise."""
+        """One report for the end, one for what was left out, one for what may be a mistake in the scene."""
         levels = {"done": "INFO", "stopped": "WARNING", "failed": "ERROR"}
+        if outcome.left_out:
+            self.report({"INFO"}, f"Left out: {'; '.join(outcome.left_out)}")
         if outcome.warnings:
             self.report({"WARNING"}, "; ".join(outcome.warnings))
         self.report({levels[outcome.kind]}, outcome.message)

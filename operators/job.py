@@ -28,6 +28,7 @@ class Outcome:
     kind: str
     message: str
     warnings: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
 
 
 class Job:
@@ -135,9 +136,9 @@ def write_snapshot(depsgraph: bpy.types.Depsgraph, path: Path) -> None:
 def _outcome(worker: Worker) -> Outcome:
     """What the worker left, in words."""
     if worker.result is not None:
-        warnings = [str(text) for text in worker.result.get("warnings", [])]
-        warnings += [f"{left['what']}: {left['why']}" for left in worker.result.get("left_out", [])]
-        return Outcome("done", summary(worker.result), tuple(warnings))
+        warnings = tuple(str(text) for text in worker.result.get("warnings", []))
+        left_out = tuple(f"{left['what']}: {left['why']}" for left in worker.result.get("left_out", []))
+        return Outcome("done", summary(worker.result), warnings, left_out)
     if worker.stopped:
         return Outcome("stopped", "Bake cancelled; finished cells are kept")
     return Outcome("failed", worker.error)

@@ -7,7 +7,7 @@ import bpy
 from . import dependencies, job
 
 ROOT_PACKAGE = __package__.rpartition(".")[0]
-MOST_WARNINGS = 5
+MOST_NOTES = 5
 
 
 class _Main:
@@ -159,10 +159,11 @@ def draw_outcome(layout: bpy.types.UILayout, outcome: job.Outcome | None) -> Non
     icons = {"done": "CHECKMARK", "stopped": "INFO", "failed": "ERROR"}
     column = layout.column(align=True)
     column.label(text=outcome.message, icon=icons[outcome.kind])
-    for text in outcome.warnings[:MOST_WARNINGS]:
-        column.label(text=text, icon="DOT")
-    if len(outcome.warnings) > MOST_WARNINGS:
-        column.label(text=f"and {len(outcome.warnings) - MOST_WARNINGS} more, see the Info editor")
+    notes = [(text, "ERROR") for text in outcome.warnings] + [(text, "DOT") for text in outcome.left_out]
+    for text, icon in notes[:MOST_NOTES]:
+        column.label(text=text, icon=icon)
+    if len(notes) > MOST_NOTES:
+        column.label(text=f"and {len(notes) - MOST_NOTES} more: see the Info editor")
 
 
 CLASSES = (

@@ -49,9 +49,9 @@ class GIVOLUMES_PG_scene(bpy.types.PropertyGroup):
     )
     finest: FloatProperty(
         name="Finest Voxel",
-        description="Size of the smallest voxels, in metres (0.5 by default); scaled in very small or large scenes",
-        default=0.5,
-        min=0.001,
+        description="Size of the smallest voxels, in metres; 0 (the default) fits it to the scene, 0.5 at human scale",
+        default=0.0,
+        min=0.0,
         soft_max=2.0,
         subtype="DISTANCE",
     )
@@ -141,9 +141,10 @@ def arguments(scene: bpy.types.Scene) -> dict[str, str]:
     options = {
         "--quality": settings.quality,
         "--sun": settings.sun,
-        "--finest": f"{settings.finest:g}",
         "--seed": str(settings.seed),
     }
+    if settings.finest:
+        options["--finest"] = f"{settings.finest:g}"
     if settings.threads:
         options["--threads"] = str(settings.threads)
     return options

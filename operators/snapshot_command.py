@@ -56,7 +56,7 @@ def write(scene: Path, output: Path) -> None:
         raise ValueError(f"{scene}: not a scene; expected {', '.join(SUFFIXES)}")
     if not scene.is_file():
         raise FileNotFoundError(f"{scene}: no such file")
-    if "bpy" not in sys.modules and importlib.util.find_spec("bpy") is None:
+    if sys.modules.get("bpy") is None and importlib.util.find_spec("bpy") is None:
         raise ValueError(
             f"{scene}: reading a {scene.suffix} file needs Blender's Python module: run 'make setup', "
             "or bake inside Blender: blender -b FILE --command gi_volumes bake"

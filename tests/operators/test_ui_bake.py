@@ -45,7 +45,7 @@ def main(argv, extract):
             (folder / "kept").touch()
             return 130
     say(result={"data_points": 12345, "bytes": {"tree": 1000000, "local": 500000}, "seconds": {"trace": 61.0},
-                "warnings": [], "left_out": [{"what": "sun", "why": "the scene has none"}]})
+                "warnings": ["a lamp has no power"], "left_out": [{"what": "sun", "why": "the scene has none"}]})
     return 0
 """
 STAND_IN_SNAPSHOT_FILE = "def save(snapshot, path):\n    open(path, 'wb').write(snapshot)\n"
@@ -115,13 +115,14 @@ scene.gi_volumes.threads = 3
 assert bpy.ops.gi_volumes.bake() == {"FINISHED"}
 from bl_ext.dev.gi_volumes.operators import job
 assert job.current is None
-print("LAST", job.last.kind, "|", job.last.message, "|", job.last.warnings)
+print("LAST", job.last.kind, "|", job.last.message, "|", job.last.warnings, job.last.left_out)
 import json
 argv, has_bpy, size = json.loads((output / "argv.json").read_text())
 print("ARGV", argv[2:], has_bpy, size, Path(argv[1]).parent.exists())
 """)
-    assert "LAST done | Baked 12,345 data points, 1.5 MB in 1 min 1 s | ('sun: the scene has none',)" in said
-    options = ["-o", str(tmp_path / "out"), "--quality", "draft", "--sun", "scene", "--finest", "0.5"]
+    assert "LAST done | Baked 12,345 data points, 1.5 MB in 1 min 1 s |" in said
+    assert "| ('a lamp has no power',) ('sun: the scene has none',)" in said
+    options = ["-o", str(tmp_path / "out"), "--quality", "draft", "--sun", "scene"]
     assert f"ARGV {[*options, '--seed', '0', '--threads', '3', '--progress', 'json']} False 21 False" in said
 
 
@@ -206,7 +207,7 @@ while job.current.progress.stage != "Tracing" or not (output / "started").exists
     time.sleep(0.05)
 print(job.current.progress.text)
 addon_utils.disable(NAME, default_set=True)
-print("KEPT", (output / "kept").exists(), [n for n in dir(bpy.types) if "GIVOLUMES" in n])
+print("KEPT", (output / "kept").exists(), [n for n in dir(bpy.types) if "GIVOLUMES" in n or "GI_VOLUMES" in n])
 """,
         "hang",
     )
@@ -270,9 +271,9 @@ print("ARGV", json.loads((output / "other" / "argv.json").read_text())[0][2:])
 """)
     assert said.count("CODE 0") == 2
     out = str(tmp_path / "out")
-    first = ["--seed", "7", "--quality", "final", "--sun", "scene", "--finest", "0.5", "-o", out]
+    first = ["--seed", "7", "--quality", "final", "--sun", "scene", "-o", out]
     assert f"ARGV {first}" in said
-    second = ["-o", f"{out}/other", "--quality=draft", "--sun", "scene", "--finest", "0.5", "--seed", "0"]
+    second = ["-o", f"{out}/other", "--quality=draft", "--sun", "scene", "--seed", "0"]
     assert f"ARGV {second}" in said
 
 
