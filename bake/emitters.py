@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from . import warp
-from .lamps import LUMINANCE
+from .lamps import luminance
 from .soup import Soup
 from .surfaces import Surfaces
 
@@ -105,5 +105,5 @@ def _mean_emission(surfaces: Surfaces, rows: np.ndarray) -> np.ndarray:
     total = np.zeros(len(rows))
     for (b1, b2), weight in zip(PROBES, PROBE_WEIGHTS, strict=True):
         u, v = np.full(len(rows), b1, np.float32), np.full(len(rows), b2, np.float32)
-        total += weight * (LUMINANCE @ surfaces.emission(rows, u, v))
+        total += weight * luminance(surfaces.emission(rows, u, v))
     return np.maximum(total, 0)

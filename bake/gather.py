@@ -271,7 +271,7 @@ def _direct(scene: Scene, sensor: Sensor, position, rows, numbers: Numbers, lane
     if scene.model.local and scene.reflectors.count:
         sample = scene.reflectors.sample(position, None, numbers.draw(lanes, DIRECT_DIMENSIONS, 4))
         direction = _unit(sample.toward)
-        seen = (position, sample.toward, TARGET_SHORTENED, sample.irradiance.any(axis=0), sample.shadow)
+        seen = (position, sample.toward, TARGET_SHORTENED, sample.lit, sample.shadow)
         yield 0, direction, _visible(scene, sample.irradiance, *seen)
     if scene.model.local and scene.emitters.count:
         toward, radiance, density = scene.emitters.sample(position, numbers.draw(lanes, DIRECT_DIMENSIONS + 4, 3))

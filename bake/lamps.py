@@ -31,11 +31,13 @@ class LampSample:
     toward : (3, n) float32 [m], from the surface to the lamp; not of unit length
     irradiance : (3, n) float32 [W/m2] on a surface that faces it, over the sample's probability; 0 for none
     shadow : (n,) bool, whether the way has to be free
+    lit : (n,) bool, whether there is any light
     """
 
     toward: np.ndarray
     irradiance: np.ndarray
     shadow: np.ndarray
+    lit: np.ndarray
 
 
 class Lamps:
@@ -61,6 +63,7 @@ class Lamps:
         self._size = np.ascontiguousarray(lights.size[rows].T)
         self._spot = np.ascontiguousarray(lights.spot[rows].T)
         self._shadow = lights.shadow[rows]
+        self._luminance = luminance(self._strength)
         power = _power(self._kind, self._strength, self._size, self._spot)
         total = power.sum()
         self._pmf = (power / total if total > 0 else np.full(self.count, 1 / max(self.count, 1))).astype(np.float32)
@@ -85,41 +88,41 @@ class Lamps:
 
         Notes
         -----
-        Source: Talbot 2005, resampled importance sampling, with a streaming reservoir (Bitterli et al. 2020).
+        Source: Talbot 2005, resampled importance sampling.
         """
         draw, pick, u1, u2 = u
-        lanes = position.shape[1]
-        kept = LampSample(np.ones_like(position), np.zeros_like(position), np.zeros(lanes, bool))
-        kept_weight = np.ones(lanes, np.float32)
-        total = np.zeros(lanes, np.float32)
-        for lamp, inverse_density in self._candidates(draw):
-            toward, irradiance = self._evaluate(lamp, position, u1, u2)
-            value = LUMINANCE @ irradiance
-            if normal is not None:
-                value = value * np.maximum(warp.dot(normal, toward), 0) / np.sqrt(warp.dot(toward, toward))
-            weight = value * inverse_density
-            total += weight
-            share = np.divide(weight, total, out=np.zeros_like(weight), where=total > 0)
-            take = pick < share
-            pick = _reuse(pick, share, take)
-            _keep(kept, take, toward, irradiance, np.broadcast_to(self._shadow[lamp], (lanes,)))
-            kept_weight[take] = value[take]
-        kept.irradiance[...] *= np.divide(total, kept_weight)
-        return kept
+        candidates, weights = self._weigh(position, normal, draw, u1, u2)
+        chosen, total = _choose(weights, pick)
+        lanes = np.arange(position.shape[1])
+        weight = weights[chosen, lanes]
+        lamp = chosen if candidates is None else candidates[chosen, lanes]
+        toward, falloff = self._evaluate(lamp, position, u1, u2)
+        if candidates is not None:
+            weight = weight * (CANDIDATES * self._pmf[lamp])
+        falloff = falloff * np.divide(total, weight, out=np.zeros_like(total), where=weight > 0)
+        return LampSample(toward, self._strength[:, lamp] * falloff, self._shadow[lamp] & (falloff > 0), falloff > 0)
 
-    def _candidates(self, draw: np.ndarray):
-        """(lamp numbers, inverse of the density they were drawn with); one number stands for all lanes."""
+    def _weigh(self, position, normal, draw, u1, u2) -> tuple[np.ndarray | None, np.ndarray]:
+        """(lamp of each candidate, or None when the candidates are all lamps; their weights), (candidates, n)."""
         if self.count <= CANDIDATES:
-            for lamp in range(self.count):
-                yield np.array([lamp]), np.float32(1)
-            return
-        for step in range(CANDIDATES):
-            drawn = (step + draw) / CANDIDATES * self._cdf[-1]
-            lamp = np.minimum(np.searchsorted(self._cdf, drawn, side="right"), self.count - 1)
-            yield lamp, 1 / (CANDIDATES * self._pmf[lamp])
+            rows = [np.array([lamp]) for lamp in range(self.count)]
+            return None, np.stack([self._target(lamp, position, normal, u1, u2) for lamp in rows])
+        steps = (np.arange(CANDIDATES)[:, None] + draw) / CANDIDATES * self._cdf[-1]
+        lamps = np.minimum(np.searchsorted(self._cdf, steps, side="right"), self.count - 1)
+        weights = np.stack([self._target(lamp, position, normal, u1, u2) for lamp in lamps])
+        return lamps, weights / (CANDIDATES * self._pmf[lamps])
+
+    def _target(self, lamp, position, normal, u1, u2) -> np.ndarray:
+        """(n,) luminance that a lamp would bring without shadows, on a surface that faces `normal` or the lamp."""
+        toward, falloff = self._evaluate(lamp, position, u1, u2)
+        value = self._luminance[lamp] * falloff
+        if normal is None:
+            return value
+        cosine = np.maximum(warp.dot(normal, toward), 0)
+        return value * cosine / np.sqrt(np.maximum(warp.dot(toward, toward), NEAREST * NEAREST))
 
     def _evaluate(self, lamp: np.ndarray, position: np.ndarray, u1: np.ndarray, u2: np.ndarray):
-        """(vector to a point of the lamp, irradiance it brings on a surface facing it)."""
+        """(vector to a point of the lamp, irradiance on a surface facing it over the lamp's strength)."""
         center = self._position[:, lamp] - position
         round_lamp = self._kind[lamp] <= LightKind.SPOT
         if round_lamp.all():
@@ -127,7 +130,7 @@ class Lamps:
         if not round_lamp.any():
             return self._evaluate_area(lamp, center, u1, u2)
         first, second = self._evaluate_round(lamp, center, u1, u2), self._evaluate_area(lamp, center, u1, u2)
-        return tuple(np.where(round_lamp, a, b) for a, b in zip(first, second, strict=True))
+        return np.where(round_lamp, first[0], second[0]), np.where(round_lamp, first[1], second[1])
 
     def _evaluate_round(self, lamp, center, u1, u2) -> tuple[np.ndarray, np.ndarray]:
         """Points and spots: a disk that always faces the surface, of the lamp's radius."""
@@ -142,7 +145,7 @@ class Lamps:
         squared = np.maximum(warp.dot(toward, toward), NEAREST * NEAREST)
         facing = warp.dot(toward, axis) / np.sqrt(squared)
         falloff = np.maximum(facing, 0) / squared * self._cone(lamp, axis)
-        return toward, self._strength[:, lamp] * falloff
+        return toward, falloff
 
     def _cone(self, lamp: np.ndarray, axis: np.ndarray) -> np.ndarray:
         """Blender's spot: a smooth step in the cosine, over the blend."""
@@ -167,25 +170,39 @@ class Lamps:
         squared = np.maximum(warp.dot(toward, toward), NEAREST * NEAREST)
         z = self._z[:, lamp]
         cosine = (toward[0] * z[0] + toward[1] * z[1] + toward[2] * z[2]) / np.sqrt(squared)
-        return toward, self._strength[:, lamp] * (area * np.maximum(cosine, 0) / squared)
+        return toward, area * np.maximum(cosine, 0) / squared
+
+
+def _choose(weights: np.ndarray, pick: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(row chosen for each lane by its share of the weights, their total)."""
+    sums = [weights[0]]
+    for weight in weights[1:]:
+        sums.append(sums[-1] + weight)
+    mark = pick * sums[-1]
+    chosen = np.zeros(len(pick), np.int64)
+    for below in sums[:-1]:
+        chosen += below <= mark
+    return chosen, sums[-1]
+
+
+def luminance(color: np.ndarray) -> np.ndarray:
+    """Weigh colours by Rec.709; a plain sum, as a matrix product would start threads of its own.
+
+    Parameters
+    ----------
+    color : (3, n) ndarray
+        Linear colours.
+
+    Returns
+    -------
+    (n,) ndarray
+        Luminance.
+    """
+    red, green, blue = LUMINANCE
+    return color[0] * red + color[1] * green + color[2] * blue
 
 
 def _power(kind: np.ndarray, strength: np.ndarray, size: np.ndarray, spot: np.ndarray) -> np.ndarray:
     """Emitted power, to draw candidates by [W]."""
-    luminance = LUMINANCE @ strength
     area = size[0] * size[1] * np.where(kind == LightKind.ELLIPSE, np.pi / 4, 1)
-    return luminance * np.where(kind <= LightKind.SPOT, 2 * np.pi * (1 - spot[0]), np.pi * area)
-
-
-def _reuse(u: np.ndarray, share: np.ndarray, take: np.ndarray) -> np.ndarray:
-    """What is left of a uniform number after a choice made with it is uniform again."""
-    kept = u / np.where(take, share, 1)
-    left = (u - share) / np.where(take, 1, np.maximum(1 - share, np.float32(1e-7)))
-    return np.clip(np.where(take, kept, left), 0, np.float32(1 - 2.0**-24))
-
-
-def _keep(kept: LampSample, take: np.ndarray, toward, irradiance, shadow) -> None:
-    """Replace the reservoir's sample where the new one was taken."""
-    np.copyto(kept.toward, toward, where=take)
-    np.copyto(kept.irradiance, irradiance, where=take)
-    np.copyto(kept.shadow, shadow, where=take)
+    return luminance(strength) * np.where(kind <= LightKind.SPOT, 2 * np.pi * (1 - spot[0]), np.pi * area)

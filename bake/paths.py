@@ -235,9 +235,9 @@ def _add_lamps(scene: Scene, wave: Wave, vertex: Vertex, numbers: Numbers, bounc
     sample = scene.lamps.sample(vertex.position, vertex.normal, u)
     length = np.sqrt(warp.dot(sample.toward, sample.toward))
     cosine = np.maximum(warp.dot(sample.toward, vertex.normal), 0) / np.maximum(length, np.float32(1e-30))
-    value = sample.irradiance * cosine
-    rows, tint = unblocked(scene, vertex.position, sample.toward, TARGET_SHORTENED, value.any(axis=0), sample.shadow)
-    _collect(light.local, wave, vertex, rows, value[:, rows] * tint)
+    useful = sample.lit & (cosine > 0)
+    rows, tint = unblocked(scene, vertex.position, sample.toward, TARGET_SHORTENED, useful, sample.shadow)
+    _collect(light.local, wave, vertex, rows, sample.irradiance[:, rows] * cosine[rows] * tint)
 
 
 def _add_emitters(scene: Scene, wave: Wave, vertex: Vertex, numbers: Numbers, bounce: int, light: Radiance) -> None:
@@ -288,9 +288,10 @@ def _collect(target: np.ndarray, wave: Wave, vertex: Vertex, rows: np.ndarray, i
 def _scatter(wave: Wave, vertex: Vertex, numbers: Numbers, bounce: int) -> Wave:
     """Choose the next direction by the cosine, and end dim paths by chance."""
     beta = wave.beta * vertex.reflectance
-    rows = np.flatnonzero(beta.max(axis=0) > 0)
+    brightest = warp.largest(beta)
+    rows = np.flatnonzero(brightest > 0)
     if bounce >= ROULETTE_START:
-        survival = np.minimum(beta.max(axis=0), 1)
+        survival = np.minimum(brightest, 1)
         u = numbers.draw(wave.lane, HASHED + bounce * HASHED_PER_VERTEX + ROULETTE, 1)[0]
         rows = np.flatnonzero(u < survival)
         beta /= np.maximum(survival, np.float32(1e-30))
@@ -386,7 +387,7 @@ def _transmittance(scene: Scene, position: np.ndarray, toward: np.ndarray, limit
         step = hits.distance + scene.tracer.offset(here, hits.distance * length[active]) / length[active]
         start[:, active] += toward[:, active] * step
         left[active] -= step
-        active = active[(left[active] > 0) & (tint[:, active].max(axis=0) > 0)]
+        active = active[(left[active] > 0) & (warp.largest(tint[:, active]) > 0)]
     tint[:, active] = 0
     return tint
 

@@ -14,6 +14,8 @@ import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
+from . import warp
+
 MISS = -1
 """`Hits.triangle` of a ray that left the scene."""
 
@@ -144,7 +146,7 @@ class Tracer:
         (n,) float32 ndarray
             Metres along the facing normal.
         """
-        magnitude = np.abs(position).max(axis=0)
+        magnitude = warp.largest(np.abs(position))
         return (magnitude + distance) * RELATIVE_OFFSET + np.float32(self.size * SCENE_OFFSET)
 
     def _first_hit(self, scene: EmbreeScene, origin: np.ndarray, direction: np.ndarray, far: np.ndarray | None) -> Hits:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..tree import harmonics
-from .lamps import LUMINANCE
+from .lamps import luminance
 
 UNEVEN = 8.0
 """A sky whose brightest texel exceeds its mean this many times gets shadow rays of its own; a smoother one is
@@ -31,12 +31,12 @@ class Sky:
         edges = np.sin(np.linspace(-np.pi / 2, np.pi / 2, self._height + 1))
         solid_angle = np.repeat(np.diff(edges), self._width) * (2 * np.pi / self._width)
         self._edges = edges
-        power = (LUMINANCE.astype(np.float64) @ self._texels) * solid_angle
+        power = luminance(self._texels.astype(np.float64)) * solid_angle
         total = float(power.sum())
         self.mean = (self._texels.astype(np.float64) @ solid_angle) / (4 * np.pi)
         self.dark = total <= 0
         mean = total / (4 * np.pi)
-        self.uneven = not self.dark and float((LUMINANCE @ self._texels).max()) > UNEVEN * mean
+        self.uneven = not self.dark and float(luminance(self._texels).max()) > UNEVEN * mean
         self._cdf = np.cumsum(power) / total if self.uneven else np.zeros(0)
         self._pdf = (power / solid_angle / total).astype(np.float32) if self.uneven else np.zeros(0, np.float32)
 
