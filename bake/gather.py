@@ -11,14 +11,13 @@ import os
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
-from ..tree import harmonics
 from . import paths, warp
 from .paths import FAR, TARGET_SHORTENED, Numbers, Wave, unblocked
 from .scene import Scene
+from .sensors import Sensor
 from .sobol import Sampler, scramble
 
 TILE_LANES = 65536
@@ -29,66 +28,6 @@ BLOCK_SAMPLES = 1024
 
 DIRECT_DIMENSIONS = paths.HASHED - 64
 """Random numbers of the direct light at the point itself, apart from every path vertex's."""
-
-
-class Sensor(Protocol):
-    """What is measured at points: directions to sample, their density, and the response to radiance."""
-
-    responses: int
-
-    def sample(self, rows: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """(3, n) unit directions for the points `rows`."""
-
-    def pdf(self, rows: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """(n,) density of `sample` [1/sr]."""
-
-    def response(self, rows: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """(responses, n) measure of unit radiance from a direction."""
-
-
-class DataPoints:
-    """Measures the nine harmonics of irradiance around points in free space."""
-
-    responses = 9
-
-    def sample(self, rows, u, v):
-        """Uniform directions."""
-        return warp.sphere(u, v)
-
-    def pdf(self, rows, direction):
-        """Constant."""
-        return np.full(len(rows), warp.SPHERE_PDF, np.float32)
-
-    def response(self, rows, direction):
-        """Real harmonics times the cosine lobe's coefficients (Ramamoorthi and Hanrahan 2001, equation 8)."""
-        return harmonics.basis(direction.T).T * harmonics.COSINE.astype(np.float32)[:, None]
-
-
-class SurfacePoints:
-    """Measures irradiance on surfaces.
-
-    Parameters
-    ----------
-    normal : (3, n) float32 ndarray
-        Unit normals of all points.
-    """
-
-    responses = 1
-
-    def __init__(self, normal: np.ndarray) -> None:
-        self._normal = normal
-
-    def sample(self, rows, u, v):
-        """Directions by the cosine."""
-        return warp.cosine(u, v, self._normal[:, rows])
-
-    def pdf(self, rows, direction):
-        """The cosine over pi."""
-        return np.maximum(warp.dot(direction, self._normal[:, rows]), paths.GRAZING) * np.float32(1 / np.pi)
-
-    def response(self, rows, direction):
-        """The cosine, clamped."""
-        return np.maximum(warp.dot(direction, self._normal[:, rows]), 0)[None]
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,10 @@ from ..tree import build, folder
 from ..tree.grid import Grid
 from ..tree.topology import Topology
 from . import datapoints, snapshot_file
-from .gather import CancelledError, DataPoints, Effort, Gathered, gather
+from .gather import CancelledError, Effort, Gathered, gather
 from .progress import Progress
 from .scene import Model, Scene, prepare, scene_suns
+from .sensors import DataPoints
 from .settings import Settings, SettingsError, check_scene, choose_grid, model
 from .snapshot import LightKind, Snapshot
 

@@ -54,7 +54,20 @@ class Radiance:
 
     @classmethod
     def zeros(cls, scene: Scene, lanes: int) -> Radiance:
-        """No light yet."""
+        """No light yet.
+
+        Parameters
+        ----------
+        scene : Scene
+            Says which transports there are.
+        lanes : int
+            Number of rays.
+
+        Returns
+        -------
+        Radiance
+            Zeros.
+        """
         suns, functions = len(scene.model.suns.toward), scene.model.sky_count
         shapes = ((3, lanes), (suns, 3, lanes), (functions, 3, lanes))
         return cls(*(np.zeros(shape, np.float32) for shape in shapes))
@@ -78,18 +91,50 @@ class Wave:
     pdf: np.ndarray
 
     def take(self, rows: np.ndarray) -> Wave:
-        """Some of the paths."""
+        """Some of the paths.
+
+        Parameters
+        ----------
+        rows : (m,) int64 ndarray
+            Which.
+
+        Returns
+        -------
+        Wave
+            Copies.
+        """
         return Wave(self.lane[rows], self.origin[:, rows], self.direction[:, rows], self.beta[:, rows], self.pdf[rows])
 
 
 class Numbers:
-    """Random numbers of the rays: lane i is sample `sample[i]` of point `point[i]`."""
+    """Random numbers of the rays.
+
+    Parameters
+    ----------
+    sampler : Sampler
+        Where they come from.
+    point, sample : (n,) int64 ndarray
+        Ray i is sample `sample[i]` of point `point[i]`.
+    """
 
     def __init__(self, sampler: Sampler, point: np.ndarray, sample: np.ndarray) -> None:
         self._sampler, self._point, self._sample = sampler, point, sample
 
     def draw(self, lane: np.ndarray, first: int, count: int) -> tuple[np.ndarray, ...]:
-        """`count` uniform numbers for each lane, from dimension `first` on."""
+        """Take numbers for some rays.
+
+        Parameters
+        ----------
+        lane : (m,) int64 ndarray
+            The rays.
+        first, count : int
+            Dimensions `first` to `first + count - 1`.
+
+        Returns
+        -------
+        tuple of (m,) float32 ndarray
+            Uniform in [0, 1), one array for each dimension.
+        """
         point, sample = self._point[lane], self._sample[lane]
         return tuple(self._sampler.uniform(point, sample, first + k) for k in range(count))
 

@@ -9,8 +9,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .gather import Effort, Gathered, SurfacePoints, gather
+from .gather import Effort, Gathered, gather
 from .scene import Model, Scene, prepare
+from .sensors import SurfacePoints
 from .settings import Settings, model
 from .snapshot import LightKind, Snapshot
 from .sobol import scramble
@@ -77,10 +78,12 @@ def irradiance(
     transport : str
         "local", "sky", "sun" (per W/m2 of sun irradiance, of the first sun), or "all", which is their sum with
         every sun at its own strength.
-    samples, bounces, seed, threads : int
+    samples, bounces, seed : int
         As in `Effort`.
     settings : Settings, optional
         Sky and sun other than the scene's.
+    threads : int
+        As in `Effort`.
 
     Returns
     -------

@@ -5,8 +5,9 @@ from __future__ import annotations
 import build_scenes
 import numpy as np
 import pytest
-from gi_volumes.bake.gather import DataPoints, Effort, SurfacePoints, gather
+from gi_volumes.bake.gather import Effort, gather
 from gi_volumes.bake.scene import Model, SunKeys, prepare
+from gi_volumes.bake.sensors import DataPoints, SurfacePoints
 from gi_volumes.bake.snapshot import Channel, LightKind, Material
 from gi_volumes.tree import harmonics
 
