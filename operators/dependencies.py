@@ -1,4 +1,7 @@
-"""The libraries that a worker process needs, and where this Blender found them."""
+"""The libraries that a worker process needs, and where this Blender found them.
+
+A bake cannot do without `NEEDED`; `FOR_PICTURES` are for the commands that write images.
+"""
 
 from __future__ import annotations
 
@@ -6,18 +9,19 @@ import importlib.util
 import os
 from pathlib import Path
 
-NAMES = {"numpy": "numpy", "embreex": "embreex", "OpenEXR": "OpenEXR", "PIL": "pillow", "zstandard": "zstandard"}
+NEEDED = ("numpy", "embreex", "zstandard")
+FOR_PICTURES = ("PIL", "OpenEXR")
 
 
 def missing() -> list[str]:
-    """Return the names of the libraries that cannot be imported.
+    """Return the names of the needed libraries that cannot be imported.
 
     Returns
     -------
     list of str
-        Names as on the Python Package Index, in the order of `NAMES`.
+        Names, in the order of `NEEDED`.
     """
-    return [package for module, package in NAMES.items() if importlib.util.find_spec(module) is None]
+    return [module for module in NEEDED if importlib.util.find_spec(module) is None]
 
 
 def search_path() -> str:
@@ -29,7 +33,7 @@ def search_path() -> str:
         Folders, each once, joined by the system's separator.
     """
     folders = []
-    for module in NAMES:
+    for module in (*NEEDED, *FOR_PICTURES):
         spec = importlib.util.find_spec(module)
         if spec is None or not spec.origin:
             continue

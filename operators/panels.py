@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import textwrap
+
 import bpy
 
 from . import dependencies, job
 
 ROOT_PACKAGE = __package__.rpartition(".")[0]
 MOST_NOTES = 5
+# Mean width of a character of Blender's interface font at a scale of 1, and of a panel's borders and an icon.
+CHARACTER_PX = 7.0
+MARGIN_PX = 75.0
+FEWEST_CHARACTERS = 20
 
 
 class _Main:
@@ -108,7 +114,7 @@ class GIVOLUMES_AP_preferences(bpy.types.AddonPreferences):
 
 
 def draw_complaint(layout: bpy.types.UILayout) -> bool:
-    """Draw one line when libraries are missing.
+    """Draw what to do when libraries are missing.
 
     Parameters
     ----------
@@ -122,7 +128,7 @@ def draw_complaint(layout: bpy.types.UILayout) -> bool:
     """
     complaint = dependencies.complaint()
     if complaint:
-        layout.label(text=complaint, icon="ERROR")
+        draw_text(layout.column(align=True), complaint, "ERROR")
     return bool(complaint)
 
 
@@ -158,12 +164,30 @@ def draw_outcome(layout: bpy.types.UILayout, outcome: job.Outcome | None) -> Non
         return
     icons = {"done": "CHECKMARK", "stopped": "INFO", "failed": "ERROR"}
     column = layout.column(align=True)
-    column.label(text=outcome.message, icon=icons[outcome.kind])
+    draw_text(column, outcome.message, icons[outcome.kind])
     notes = [(text, "ERROR") for text in outcome.warnings] + [(text, "DOT") for text in outcome.left_out]
     for text, icon in notes[:MOST_NOTES]:
-        column.label(text=text, icon=icon)
+        draw_text(column, text, icon)
     if len(notes) > MOST_NOTES:
-        column.label(text=f"and {len(notes) - MOST_NOTES} more: see the Info editor")
+        draw_text(column, f"and {len(notes) - MOST_NOTES} more: see the Info editor", "BLANK1")
+
+
+def draw_text(layout: bpy.types.UILayout, text: str, icon: str) -> None:
+    """Draw text over as many lines as the region's width asks for.
+
+    Parameters
+    ----------
+    layout : bpy.types.UILayout
+        An aligned column.
+    text : str
+        What to say.
+    icon : str
+        Name of the icon before the first line.
+    """
+    scale = bpy.context.preferences.system.ui_scale
+    width = int((bpy.context.region.width / scale - MARGIN_PX) / CHARACTER_PX) if bpy.context.region else 0
+    for number, line in enumerate(textwrap.wrap(text, max(width, FEWEST_CHARACTERS))):
+        layout.label(text=line, icon="BLANK1" if number else icon)
 
 
 CLASSES = (

@@ -25,9 +25,9 @@ ROOMS = {
     **dict.fromkeys(BLENDER, ("operators/", "preview/draw.py")),
     "embreex": ("bake/rays.py",),
     "moderngl": ("preview/",),
-    "OpenEXR": ("tree/",),
+    "OpenEXR": ("tree/", "bake/picture.py"),
     "zstandard": ("tree/",),
-    "PIL": ("bake/", "operators/"),
+    "PIL": ("bake/picture.py",),
 }
 FREE = {"numpy", *sys.stdlib_module_names}
 MASK_ROOM = "tree/bits.py"

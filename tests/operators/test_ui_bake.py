@@ -178,10 +178,10 @@ assert job.current is None and bpy.ops.gi_volumes.bake.poll()
 def test_missing_libraries_are_named_and_do_not_keep_the_extension_from_starting(blender):
     said = blender("""
 from bl_ext.dev.gi_volumes.operators import dependencies
-dependencies.NAMES = {**dependencies.NAMES, "no_such_library": "no-such-library"}
+dependencies.NEEDED = (*dependencies.NEEDED, "no_such_library")
 print(failure(bpy.ops.gi_volumes.bake))
 """)
-    assert "Error: Missing: no-such-library. Install the extension's zip" in said
+    assert "Error: Missing: no_such_library. Install the extension's zip" in said
 
 
 def test_a_bake_leaves_selection_mode_and_materials_alone(blender):
