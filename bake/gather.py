@@ -238,4 +238,4 @@ def _unit(vector: np.ndarray) -> np.ndarray:
 
 def _seeded(keys: np.ndarray, seed: int) -> np.ndarray:
     """Keys that another seed makes unrelated."""
-    return scramble(scramble(keys, 0), (seed & 0x7FFFFFFF) + 1)
+    return scramble(scramble(keys, 0), (seed & 0xFFFFFFFF) + 1)
