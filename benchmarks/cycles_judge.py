@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import bpy
 import numpy as np
 
-from .scene_edits import Changes, black_world, emission_off, ensure_nodes, sources_off
+from .scene_edits import Changes, emission_off, ensure_nodes, sources_off, uniform_world
 
 HALF_SIZE = 1e-3
 """Half the edge of a quad [m], near the origin: small against the detail of a room."""
@@ -176,7 +176,7 @@ def _bake_pass(part: Pass, seeds: tuple[int, ...], atlas: bpy.types.Image) -> np
         if "emission" not in part.sources:
             emission_off(changes)
         if "world" not in part.sources:
-            changes.set(scene, world=black_world())
+            changes.set(scene, world=uniform_world("judge: black", 0.0))
         runs = []
         for seed in seeds:
             changes.set(scene.cycles, seed=seed)

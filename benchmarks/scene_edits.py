@@ -121,11 +121,25 @@ def emission_off(changes: Changes) -> None:
                 changes.set(strength, default_value=0.0)
 
 
-def black_world() -> bpy.types.World:
-    """A world without light."""
-    world = bpy.data.worlds.get("judge: black") or bpy.data.worlds.new("judge: black")
+def uniform_world(name: str, radiance: float) -> bpy.types.World:
+    """Make a white sky, or find the one of that name.
+
+    Parameters
+    ----------
+    name : str
+        Of the world.
+    radiance : float [W/(m2 sr)]
+        In all directions.
+
+    Returns
+    -------
+    bpy.types.World
+    """
+    world = bpy.data.worlds.get(name) or bpy.data.worlds.new(name)
     ensure_nodes(world)
-    next(n for n in world.node_tree.nodes if n.type == "BACKGROUND").inputs["Strength"].default_value = 0.0
+    background = next(node for node in world.node_tree.nodes if node.type == "BACKGROUND")
+    background.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
+    background.inputs["Strength"].default_value = radiance
     return world
 
 

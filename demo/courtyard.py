@@ -20,12 +20,12 @@ from mathutils import Vector
 SUN_IRRADIANCE = 5.0
 """On a surface that faces the sun [W/m2]: about 7 times what the sky gives the ground in the court."""
 SUN_ANGLE = math.radians(0.53)
-SUN_ELEVATION, SUN_AZIMUTH = math.radians(30), math.radians(224)
+SUN_ELEVATION, SUN_AZIMUTH = math.radians(34), math.radians(224)
 """Azimuth from north towards east: from the south-west, low enough to reach the walls of two galleries."""
 
 CAMERAS = {
     # name: (eye [m], target [m], focal length over a 36 mm wide film [mm])
-    "courtyard": ((-7.4, -3.75, 1.7), (2.4, 2.3, 1.75), 19.0),
+    "courtyard": ((-7.1, -3.45, 1.7), (2.4, 2.0, 1.75), 20.0),
     "gallery": ((6.35, -3.2, 1.8), (7.0, 6.5, 1.75), 21.0),
     "red room": ((11.0, -2.6, 1.7), (9.5, 5.0, 1.45), 20.0),
     "panel room": ((10.6, 7.7, 1.8), (2.6, 8.8, 1.5), 20.0),

@@ -1,0 +1,252 @@
+"""Compares our path-traced reference with Cycles, transport by transport, on surface points of a scene.
+
+    python benchmarks/cycles_agreement.py SCENE [--points N] [--samples S] [--paths P] [--bounces B]
+                                          [--materials diffuse|original] [--against ours|cycles]
+
+Comes in: a .blend, .glb or .gltf file; what lacks a sky or a sun gets one. Goes out: a line for each transport, and
+a row of agreement.csv. With diffuse materials Cycles models what we model, so that the difference has to be noise;
+with the original ones the difference is what we leave out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import math
+import subprocess
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import bpy
+import numpy as np
+from gi_volumes.benchmarks import cycles_judge, scene_edits, surface_points
+
+RESULTS = Path(__file__).with_name("agreement.csv")
+TRANSPORTS = ("sky", "sun", "local")
+SKY_RADIANCE, SUN_IRRADIANCE = 1.0, 4.0
+SUN_TILT = (math.radians(38), 0.0, math.radians(-35))
+"""Turns a sun that shines down: high enough to reach into courts and windows."""
+FIRST_SEED, SEEDS = 1, 2
+
+Estimator = Callable[[str], np.ndarray]
+"""From a transport to runs of irradiance, (k, n, 3) [W/m2]."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How two estimates of one transport compare, on the mean of the three channels.
+
+    Parameters
+    ----------
+    mean : float [W/m2]
+        Of Cycles, over all points.
+    difference : float
+        Of our mean from it, relative.
+    error : float
+        Standard error of `difference` that the noise of both explains.
+    correlation : float
+        Over the points.
+    rmse : float
+        Root mean square difference, relative to the mean.
+    noise : float
+        The same as the noise of both explains.
+    """
+
+    mean: float
+    difference: float
+    error: float
+    correlation: float
+    rmse: float
+    noise: float
+
+
+def agreement(ours: np.ndarray, judge: np.ndarray) -> Agreement:
+    """Compare two sets of runs on the same points.
+
+    Parameters
+    ----------
+    ours, judge : (k, n, 3) ndarray [W/m2]
+        At least two independent runs each; k may differ.
+
+    Returns
+    -------
+    Agreement
+        All NaN but the mean where Cycles sees no light at all.
+    """
+    means, variances = zip(*(_moments(runs) for runs in (ours, judge)), strict=True)
+    scale = means[1].mean()
+    if scale == 0:
+        return Agreement(0.0, *(5 * [math.nan]))
+    apart, variance = means[0] - means[1], variances[0] + variances[1]
+    return Agreement(
+        mean=float(scale),
+        difference=float(apart.mean() / scale),
+        error=float(np.sqrt(variance.sum()) / len(apart) / scale),
+        correlation=float(np.corrcoef(*means)[0, 1]),
+        rmse=float(np.sqrt((apart**2).mean()) / scale),
+        noise=float(np.sqrt(variance.mean()) / scale),
+    )
+
+
+def _moments(runs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(n,) mean over runs and channels, and the variance of that mean."""
+    grey = np.asarray(runs, np.float64).mean(axis=2)
+    return grey.mean(axis=0), grey.var(axis=0, ddof=1) / len(grey)
+
+
+def open_scene(path: Path) -> list[str]:
+    """Open a scene, and light it if nobody did.
+
+    Parameters
+    ----------
+    path : Path
+        A .blend, .glb or .gltf file.
+
+    Returns
+    -------
+    list of str
+        What was added.
+    """
+    if path.suffix == ".blend":
+        bpy.ops.wm.open_mainfile(filepath=str(path))
+    else:
+        bpy.ops.wm.read_homefile(use_empty=True)
+        bpy.ops.import_scene.gltf(filepath=str(path))
+    scene, added = bpy.context.scene, []
+    if scene.world is None:
+        scene.world = scene_edits.uniform_world("added sky", SKY_RADIANCE)
+        added.append("sky")
+    if not any(light.type == "SUN" for light in bpy.data.lights):
+        sun = bpy.data.lights.new("added sun", "SUN")
+        sun.energy = SUN_IRRADIANCE
+        lamp = bpy.data.objects.new("added sun", sun)
+        lamp.rotation_euler = SUN_TILT
+        scene.collection.objects.link(lamp)
+        added.append("sun")
+    bpy.context.view_layer.update()
+    return added
+
+
+def our_estimator(points: np.ndarray, normals: np.ndarray, paths: int, bounces: int) -> Estimator:
+    """Prepare our reference on the open scene.
+
+    Parameters
+    ----------
+    points, normals : (n, 3) float64 ndarray
+        World space [m], unit length.
+    paths, bounces : int
+        Paths for each point in one run, and reflections.
+
+    Returns
+    -------
+    Estimator
+        The sun at its own strength.
+    """
+    from gi_volumes.bake import reference
+    from gi_volumes.operators import extract
+
+    snapshot = extract.extract(bpy.context.evaluated_depsgraph_get())
+    suns = snapshot.lights.strength[snapshot.lights.kind == reference.LightKind.SUN]
+
+    def estimate(transport: str) -> np.ndarray:
+        scale = suns[0] if transport == "sun" else 1.0
+        seeds = range(FIRST_SEED, FIRST_SEED + SEEDS)
+        runs = [
+            reference.irradiance(snapshot, points, normals, transport, samples=paths, bounces=bounces, seed=seed)
+            for seed in seeds
+        ]
+        return np.stack(runs) * scale
+
+    return estimate
+
+
+def cycles_estimator(points: np.ndarray, normals: np.ndarray, samples: int, bounces: int, first_seed: int) -> Estimator:
+    """Prepare the judge on the open scene.
+
+    Parameters
+    ----------
+    points, normals : (n, 3) float64 ndarray
+        World space [m], unit length.
+    samples, bounces : int
+        As in `cycles_judge.Settings`.
+    first_seed : int
+        Runs have this seed and the ones after it.
+
+    Returns
+    -------
+    Estimator
+    """
+    seeds = tuple(range(first_seed, first_seed + SEEDS))
+    settings = cycles_judge.Settings(samples=samples, bounces=bounces, seeds=seeds)
+    return lambda transport: cycles_judge.irradiance(points, normals, transport, settings).runs
+
+
+def main() -> None:
+    """Compare, print, and append to the results."""
+    options = _parse()
+    added = open_scene(options.scene)
+    points, normals = surface_points.pick(surface_points.world_triangles(), options.points, options.seed)
+    if options.against == "ours":
+        ours = our_estimator(points, normals, options.paths, options.bounces)
+    else:
+        ours = cycles_estimator(points, normals, options.samples, options.bounces, FIRST_SEED + SEEDS)
+    judge = cycles_estimator(points, normals, options.samples, options.bounces, FIRST_SEED)
+    if options.materials == "diffuse":
+        scene_edits.make_diffuse()
+    print(f"{options.scene.name}: {len(points)} points, added {', '.join(added) or 'nothing'}")
+    for transport in TRANSPORTS:
+        result = agreement(ours(transport), judge(transport))
+        print(_line(transport, result))
+        if options.record:
+            _append(options, transport, result)
+
+
+def _parse() -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("scene", type=Path, help=".blend, .glb or .gltf file")
+    parser.add_argument("--points", type=int, default=1000)
+    parser.add_argument("--samples", type=int, default=128, help="of Cycles for each point, seed and pass")
+    parser.add_argument("--paths", type=int, default=512, help="of ours for each point and seed")
+    parser.add_argument("--bounces", type=int, default=4)
+    parser.add_argument("--seed", type=int, default=0, help="of the choice of points")
+    parser.add_argument("--materials", choices=("diffuse", "original"), default="diffuse")
+    parser.add_argument(
+        "--against", choices=("ours", "cycles"), default="ours", help="cycles: the judge against itself"
+    )
+    parser.add_argument("--no-record", dest="record", action="store_false", help="leave agreement.csv alone")
+    return parser.parse_args()
+
+
+def _line(transport: str, result: Agreement) -> str:
+    """A result for people."""
+    return (
+        f"{transport:6} mean {result.mean:9.5f} W/m2   difference {100 * result.difference:+7.3f} % "
+        f"+- {100 * result.error:.3f} %   correlation {result.correlation:.4f}   "
+        f"RMSE {100 * result.rmse:.1f} % (noise {100 * result.noise:.1f} %)"
+    )
+
+
+def _append(options: argparse.Namespace, transport: str, result: Agreement) -> None:
+    """Add a row to the results, under a header if it is the first."""
+    names = ("points", "samples", "paths", "bounces", "seed", "materials", "against")
+    row = {"commit": _commit(), "blender": bpy.app.version_string, "scene": options.scene.name, "transport": transport}
+    row |= {name: getattr(options, name) for name in names}
+    row |= {name: f"{value:.6g}" for name, value in asdict(result).items()}
+    is_new = not RESULTS.exists()
+    with RESULTS.open("a", newline="") as file:
+        writer = csv.DictWriter(file, row, lineterminator="\n")
+        if is_new:
+            writer.writeheader()
+        writer.writerow(row)
+
+
+def _commit() -> str:
+    """The commit that is checked out, with a plus when files differ from it."""
+    command = ["git", "-C", str(RESULTS.parent), "describe", "--always", "--dirty=+", "--abbrev=9"]
+    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip() or "unknown"
+
+
+if __name__ == "__main__":
+    main()
