@@ -119,6 +119,31 @@ def place(
     return Placement(position, offset, valid)
 
 
+def morton_order(position: np.ndarray) -> np.ndarray:
+    """Order points along a space-filling curve, so that a tile's rays stay together.
+
+    Parameters
+    ----------
+    position : (3, n) float32 ndarray
+        Points.
+
+    Returns
+    -------
+    (n,) int64 ndarray
+        Rows, sorted by 30-bit Morton code.
+    """
+    if position.shape[1] == 0:
+        return np.zeros(0, np.int64)
+    low = position.min(axis=1, keepdims=True)
+    step = max(float(np.ptp(position, axis=1).max()), 1e-30) / 1023
+    code = np.zeros(position.shape[1], np.int64)
+    lattice = ((position - low) / step).astype(np.int64)
+    for bit in range(10):
+        for axis in range(3):
+            code |= (lattice[axis] >> bit & 1) << (3 * bit + axis)
+    return np.argsort(code, kind="stable")
+
+
 def _judge(scene: Scene, position: np.ndarray, key: np.ndarray, size: np.ndarray):
     """(rows that are inside, (rows, CANDIDATES, 3) float64 vectors through the nearest backs, NaN for none)."""
     direction, distance, back = _probe(scene, position, key)

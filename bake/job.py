@@ -166,7 +166,7 @@ def _bake_cell(scene, grid: Grid, tree: Topology, target, settings: Settings, th
     key = datapoints.keys(level, coords)
     placed = datapoints.place(scene, grid.centers(level, coords), size, key, threads)
     rows = np.flatnonzero(placed.valid)
-    order = rows[morton_order(placed.position[:, rows])]
+    order = rows[datapoints.morton_order(placed.position[:, rows])]
     effort = Effort(settings.samples, settings.bounces, settings.seed, threads)
     position = np.ascontiguousarray(placed.position[:, order])
     found = gather(scene, DataPoints(), position, key[order], effort, show)
@@ -189,31 +189,6 @@ def _spread(values: np.ndarray, rows: np.ndarray, size: int) -> np.ndarray:
     out = np.zeros((size, *values.shape[1:]), np.float32)
     out[rows] = values
     return out
-
-
-def morton_order(position: np.ndarray) -> np.ndarray:
-    """Order points along a space-filling curve, so that a tile's rays stay together.
-
-    Parameters
-    ----------
-    position : (3, n) float32 ndarray
-        Points.
-
-    Returns
-    -------
-    (n,) int64 ndarray
-        Rows, sorted by 30-bit Morton code.
-    """
-    if position.shape[1] == 0:
-        return np.zeros(0, np.int64)
-    low = position.min(axis=1, keepdims=True)
-    step = max(float(np.ptp(position, axis=1).max()), 1e-30) / 1023
-    code = np.zeros(position.shape[1], np.int64)
-    lattice = ((position - low) / step).astype(np.int64)
-    for bit in range(10):
-        for axis in range(3):
-            code |= (lattice[axis] >> bit & 1) << (3 * bit + axis)
-    return np.argsort(code, kind="stable")
 
 
 def _header(snapshot: Snapshot, settings: Settings, light: Model, scene: Scene, grid: Grid, identity: str) -> dict:
@@ -291,4 +266,4 @@ def _list(cells) -> str:
     return "/".join(f"{i},{j}" for i, j in cells)
 
 
-__all__ = ["CancelledError", "Outcome", "bake", "bake_hash", "morton_order"]
+__all__ = ["CancelledError", "Outcome", "bake", "bake_hash"]

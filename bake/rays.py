@@ -20,7 +20,7 @@ MISS = -1
 """`Hits.triangle` of a ray that left the scene."""
 
 SKIP = np.float32(-1)
-"""A far distance that makes Embree skip the ray."""
+"""A far distance that makes Embree skip the ray; embreex then says that it is blocked, `blocked` that it is free."""
 
 RELATIVE_OFFSET = np.float32(1e-6)
 """Offset of a ray's origin per metre of its coordinates and of the ray that led there: about eight float32 steps."""
@@ -125,11 +125,11 @@ class Tracer:
         (n,) bool ndarray
             True where something is in the way.
         """
-        _check(origin, direction)
+        _check(origin, direction, far)
         start = time.thread_time()
         found = self._opaque.run(origin.T, direction.T, np.ascontiguousarray(far, np.float32), query="OCCLUDED")
         self._count(len(found), start)
-        return found == 0
+        return (found == 0) & (far >= 0)
 
     def offset(self, position: np.ndarray, distance: np.ndarray) -> np.ndarray:
         """How far to move a ray's origin off the surface so that it doesn't hit that surface again.
@@ -151,7 +151,7 @@ class Tracer:
 
     def _first_hit(self, scene: EmbreeScene, origin: np.ndarray, direction: np.ndarray, far: np.ndarray | None) -> Hits:
         """One intersection query; `far` is copied because Embree overwrites it."""
-        _check(origin, direction)
+        _check(origin, direction, far)
         start = time.thread_time()
         limit = None if far is None else np.array(far, np.float32)
         found = scene.run(origin.T, direction.T, limit, output=True)
@@ -176,7 +176,10 @@ def _commit(corners: np.ndarray) -> EmbreeScene:
     return scene
 
 
-def _check(origin: np.ndarray, direction: np.ndarray) -> None:
+def _check(origin: np.ndarray, direction: np.ndarray, far: np.ndarray | None) -> None:
     """Embree reads out of bounds when these differ."""
     if origin.shape != direction.shape or origin.dtype != np.float32 or direction.dtype != np.float32:
         raise ValueError(f"rays: want equal (3, n) float32, got {origin.shape} {direction.shape}")
+    if origin.ndim != 2 or len(origin) != 3 or (far is not None and far.shape != origin.shape[1:]):
+        ends = "" if far is None else f" ending at {far.shape}"
+        raise ValueError(f"rays: want (3, n) origins and directions, and (n,) ends, got {origin.shape}{ends}")

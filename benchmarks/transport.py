@@ -17,7 +17,7 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from gi_volumes.bake import datapoints, job, snapshot_file
+from gi_volumes.bake import datapoints, snapshot_file
 from gi_volumes.bake.gather import Effort, gather
 from gi_volumes.bake.rays import Tracer
 from gi_volumes.bake.scene import Model, prepare, scene_suns
@@ -105,7 +105,7 @@ def data_points(scene, count: int):
     center = rng.uniform(*inner, (3 * count, 3))
     placed = datapoints.place(scene, center, np.full(len(center), 0.5), np.arange(len(center), dtype=np.uint32))
     position = placed.position[:, placed.valid][:, :count]
-    order = job.morton_order(position)
+    order = datapoints.morton_order(position)
     return np.ascontiguousarray(position[:, order]), order.astype(np.uint32)
 
 
