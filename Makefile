@@ -37,7 +37,7 @@ endif
 	$(RUN_52) $(INSTALL)
 	@touch $@
 
-$(DEMO)/courtyard.blend: demo/courtyard.py | setup
+$(DEMO)/courtyard.blend: $(wildcard demo/*.py) | setup
 	@mkdir -p $(DEMO)
 	$(RUN) demo/courtyard.py $@
 

@@ -117,7 +117,6 @@ class GIVOLUMES_OT_cancel(bpy.types.Operator):
 
     bl_idname = "gi_volumes.cancel"
     bl_label = "Cancel Bake"
-    bl_options = {"INTERNAL"}
 
     @classmethod
     def poll(cls, context):

@@ -45,7 +45,7 @@ class _Details:
         layout.use_property_split = True
         layout.use_property_decorate = False
         layout.enabled = job.current is None
-        for name in ("sun", "finest", "threads", "seed"):
+        for name in ("sun", "sky", "finest", "threads", "seed"):
             layout.prop(context.scene.gi_volumes, name)
         layout.operator("gi_volumes.clear", icon="TRASH")
 

@@ -18,6 +18,10 @@ SUNS = (
     ("hemisphere", "Any Direction", "The sun may stand anywhere at run time; larger files"),
     ("none", "None", "No sun"),
 )
+SKIES = (
+    ("scene", "Scene", "The world of the scene, as it stands"),
+    ("harmonics", "Any Sky", "The sky may change at run time; larger files"),
+)
 
 
 class SettingsError(ValueError):
@@ -45,6 +49,12 @@ class GIVOLUMES_PG_scene(bpy.types.PropertyGroup):
         name="Sun",
         description="Which sun directions the bake answers for",
         items=SUNS,
+        default="scene",
+    )
+    sky: EnumProperty(
+        name="Sky",
+        description="Which skies the bake answers for",
+        items=SKIES,
         default="scene",
     )
     finest: FloatProperty(
@@ -141,6 +151,7 @@ def arguments(scene: bpy.types.Scene) -> dict[str, str]:
     options = {
         "--quality": settings.quality,
         "--sun": settings.sun,
+        "--sky": settings.sky,
         "--seed": str(settings.seed),
     }
     if settings.finest:

@@ -100,6 +100,13 @@ def scenario():
     seen["steps"].append(["disable", "alive"])
     picture("5_enabled_again")
 
+    running = start("final", "left")
+    yield from until(lambda: running.progress.stage == "Baking", running)
+    bpy.ops.wm.read_homefile(app_template="")
+    yield
+    seen["steps"].append(["another file", job().last.kind])
+    picture("6_another_file")
+
 
 def tick():
     """One step of the scenario; the result is written whatever happens."""

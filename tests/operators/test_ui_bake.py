@@ -122,7 +122,7 @@ print("ARGV", argv[2:], has_bpy, size, Path(argv[1]).parent.exists())
 """)
     assert "LAST done | Baked 12,345 data points, 1.5 MB in 1 min 1 s |" in said
     assert "| ('a lamp has no power',) ('sun: the scene has none',)" in said
-    options = ["-o", str(tmp_path / "out"), "--quality", "draft", "--sun", "scene"]
+    options = ["-o", str(tmp_path / "out"), "--quality", "draft", "--sun", "scene", "--sky", "scene"]
     assert f"ARGV {[*options, '--seed', '0', '--threads', '3', '--progress', 'json']} False 21 False" in said
 
 
@@ -271,9 +271,9 @@ print("ARGV", json.loads((output / "other" / "argv.json").read_text())[0][2:])
 """)
     assert said.count("CODE 0") == 2
     out = str(tmp_path / "out")
-    first = ["--seed", "7", "--quality", "final", "--sun", "scene", "-o", out]
+    first = ["--seed", "7", "--quality", "final", "--sun", "scene", "--sky", "scene", "-o", out]
     assert f"ARGV {first}" in said
-    second = ["-o", f"{out}/other", "--quality=draft", "--sun", "scene", "--seed", "0"]
+    second = ["-o", f"{out}/other", "--quality=draft", "--sun", "scene", "--sky", "scene", "--seed", "0"]
     assert f"ARGV {second}" in said
 
 
