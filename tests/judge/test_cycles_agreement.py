@@ -7,8 +7,8 @@ import pytest
 
 pytest.importorskip("bpy", reason="scenes are opened in Blender")
 
-from gi_volumes.benchmarks import surface_points  # noqa: E402
-from gi_volumes.benchmarks.cycles_agreement import agreement  # noqa: E402
+from gi_volumes.benchmarks import surface_points
+from gi_volumes.benchmarks.cycles_agreement import agreement
 
 SIGMAS = 4.0
 

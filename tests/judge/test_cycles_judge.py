@@ -208,15 +208,24 @@ def test_the_scene_is_left_as_it_was():
     assert strength.links[0].from_node == value
 
 
-def test_materials_made_diffuse_keep_base_colour_emission_and_alpha():
+@pytest.mark.parametrize("metallic", [0.0, 0.5, 1.0])
+def test_materials_made_diffuse_reflect_base_colour_and_fresnel_and_keep_alpha(metallic):
     material = add_floor(400.0, -2.0, albedo=0.5)
     shader = next(node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED")
-    shader.inputs["Metallic"].default_value = 1.0
+    shader.inputs["Metallic"].default_value = metallic
+    shader.inputs["Specular IOR Level"].default_value = 0.5
     shader.inputs["Alpha"].default_value = 0.75
     add_lamp("SUN", 1.0)
     scene_edits.make_diffuse()
+    fresnel = (1 - metallic) * scene_edits.average_fresnel(1.5, 0.5)
     measured = irradiance(*facing(-UP), "sun", Settings(samples=256)).mean.mean()
-    assert measured == pytest.approx(0.75 * 0.5, rel=0.01)
+    assert measured == pytest.approx(0.75 * (0.5 + 0.5 * fresnel), rel=0.004)
+
+
+def test_the_average_fresnel_term_is_the_tabulated_one():
+    # Internal reflection apart, a dielectric of index 1.5 reflects 9.18 % of diffuse light.
+    assert scene_edits.average_fresnel(1.5, 0.5) == pytest.approx(0.0918, abs=1e-4)
+    assert scene_edits.average_fresnel(1.5, 0.0) == 0.0
 
 
 @pytest.mark.parametrize(
