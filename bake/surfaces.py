@@ -15,6 +15,9 @@ from .textures import TexturePool
 KULLA_CONTY = (4.08567, 1.00071)
 """Average Fresnel reflectance of a dielectric is (ior - 1) / (a + b ior) (Kulla and Conty 2017, ior above 1)."""
 
+_SOURCES = {"r": 0, "g": 1, "b": 2, "a": 3}
+"""Textures that are read as a single channel, in gray."""
+
 
 class Surfaces:
     """The materials of a scene, ready to be evaluated at hits.
@@ -125,7 +128,7 @@ class Surfaces:
         return np.where(self._opaque_alpha[material], np.float32(1), alpha)
 
     def _evaluate(self, name: str, material, triangle, u, v) -> np.ndarray:
-        """(k, n) values of one channel."""
+        """(k, n) values of one channel; float images and vertex colours may hold negative ones, light may not."""
         table = self._channel[name]
         value = table.factor[:, material]
         if table.has_texture:
@@ -137,6 +140,8 @@ class Surfaces:
             lanes = np.flatnonzero(table.color[material])
             rgba = _interpolate(self._colors, triangle[lanes], u[lanes], v[lanes])
             value[:, lanes] *= rgba[:3] if len(value) == 3 else rgba[3:]
+        if table.has_texture or table.has_color:
+            np.maximum(value, 0, out=value)
         return value
 
 
@@ -149,7 +154,7 @@ class _ChannelTable:
         self.color = np.array([c.vertex_color for c in channels], bool)
         self.has_texture = bool((self.texture >= 0).any())
         self.has_color = bool(self.color.any())
-        self._source = np.array([-1 if c.texture is None else "rgba".find(c.texture.channel) for c in channels])
+        self._source = np.array([_SOURCES.get(c.texture.channel, -1) if c.texture else -1 for c in channels])
         self._pool = pool
 
     def sample(self, material: np.ndarray, uv: np.ndarray) -> np.ndarray:
