@@ -25,7 +25,7 @@ SUN_ELEVATION, SUN_AZIMUTH = math.radians(34), math.radians(224)
 
 CAMERAS = {
     # name: (eye [m], target [m], focal length over a 36 mm wide film [mm])
-    "courtyard": ((-7.1, -3.45, 1.7), (2.4, 2.0, 1.75), 20.0),
+    "courtyard": ((-6.5, -3.35, 1.7), (2.6, 1.5, 1.8), 19.0),
     "gallery": ((6.35, -3.2, 1.8), (7.0, 6.5, 1.75), 21.0),
     "red room": ((11.0, -2.6, 1.7), (9.5, 5.0, 1.45), 20.0),
     "panel room": ((10.6, 7.7, 1.8), (2.6, 8.8, 1.5), 20.0),
