@@ -33,6 +33,10 @@ FORMAT = "gi_volumes bake 1"
 """Part of every bake's hash: files of another definition are baked anew."""
 
 
+LISTED = 12
+"""Cells that a message names."""
+
+
 @dataclass
 class Outcome:
     """What a bake did, as the command line's JSON object."""
@@ -94,10 +98,11 @@ def bake(
     identity = bake_hash(snapshot, settings, light)
     scene = prepare(snapshot, light)
     grid = choose_grid(scene.soup.corners, snapshot.origin, settings.finest)
-    header = _header(snapshot, settings, light, scene, grid, identity)
+    occupied = [tuple(int(v) for v in cell) for cell in build.occupied_cells(scene.soup.corners, grid)]
+    header = _header(snapshot, settings, light, scene, grid, identity) | {"expected_cells": occupied}
     target.mkdir(parents=True, exist_ok=True)
     snapshot_file.save(snapshot, target / SNAPSHOT_NAME)
-    trees = _build_trees(scene, grid, cells, progress)
+    trees = _build_trees(scene, grid, _wanted(cells, occupied), progress)
     outcome = _describe(snapshot, light, scene, trees)
     try:
         _bake_cells(scene, grid, trees, target, settings, threads, identity, progress)
@@ -131,18 +136,20 @@ def bake_hash(snapshot: Snapshot, settings: Settings, light: Model) -> str:
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
-def _build_trees(scene: Scene, grid: Grid, cells, progress: Progress) -> list[Topology]:
-    """The voxel tree of every cell that holds geometry."""
-    occupied = [tuple(int(v) for v in cell) for cell in grid.cells_of(scene.soup.bounds)]
-    wanted = occupied if cells is None else cells
-    progress.stage("Building trees", len(wanted))
+def _wanted(cells: list[tuple[int, int]] | None, occupied: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """The cells that were asked for, all of them with geometry."""
+    empty = sorted(set(cells or ()) - set(occupied))
+    if empty:
+        raise SettingsError(f"--cells {_list(empty)}: no geometry there; this scene has cells {_list(occupied)}")
+    return occupied if cells is None else sorted(set(cells))
+
+
+def _build_trees(scene: Scene, grid: Grid, cells: list[tuple[int, int]], progress: Progress) -> list[Topology]:
+    """The voxel tree of every cell."""
+    progress.stage("Building trees", len(cells))
     trees = []
-    for number, cell in enumerate(wanted):
-        tree = build.build(scene.soup.corners, grid, cell)
-        if tree is not None:
-            trees.append(tree)
-        elif cells is not None:
-            raise SettingsError(f"--cells {cell[0]},{cell[1]}: no geometry there; cells {_list(occupied)}")
+    for number, cell in enumerate(cells):
+        trees.append(build.build(scene.soup.corners, grid, cell))
         progress.show(number + 1)
     return trees
 
@@ -202,7 +209,6 @@ def _header(snapshot: Snapshot, settings: Settings, light: Model, scene: Scene, 
         transports["sky"] = {"kind": light.sky, "unit": "W/m2"}
     if light.sky == "harmonics":
         transports["sky"] |= {"unit": "sr", "radiance": scene.sky.harmonics().tolist()}
-    expected = [[int(v) for v in cell] for cell in grid.cells_of(scene.soup.bounds)]
     return {
         "bake": identity,
         "snapshot": snapshot_file.digest(snapshot),
@@ -210,7 +216,6 @@ def _header(snapshot: Snapshot, settings: Settings, light: Model, scene: Scene, 
         "settings": dataclasses.asdict(settings),
         "grid": grid,
         "transports": transports,
-        "expected_cells": expected,
     }
 
 
@@ -262,8 +267,9 @@ def _file_sizes(target: Path) -> dict[str, int]:
 
 
 def _list(cells) -> str:
-    """Cells as the command line writes them."""
-    return "/".join(f"{i},{j}" for i, j in cells)
+    """Cells as the command line writes them; of many only the first."""
+    text = "/".join(f"{i},{j}" for i, j in cells[:LISTED])
+    return text + (" ..." if len(cells) > LISTED else "")
 
 
 __all__ = ["CancelledError", "Outcome", "bake", "bake_hash"]
