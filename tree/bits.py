@@ -8,9 +8,25 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["contains", "pack", "popcount", "rank", "unpack"]
+__all__ = ["contains", "pack", "popcount", "rank", "unpack", "zeros"]
 
 _ONE = np.uint64(1)
+
+
+def zeros(count: int) -> np.ndarray:
+    """Return masks without a set bit.
+
+    Parameters
+    ----------
+    count : int
+        Number of masks.
+
+    Returns
+    -------
+    (count,) uint64
+        Zeros.
+    """
+    return np.zeros(count, np.uint64)
 
 
 def popcount(mask: np.ndarray) -> np.ndarray:

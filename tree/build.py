@@ -10,7 +10,6 @@ children of a pair are tested only against its own triangle.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -248,7 +247,7 @@ def _next_voxels(voxels: Voxels, mask: np.ndarray, pairs: tuple[np.ndarray, np.n
 
 def _to_nodes(masks: list[np.ndarray], dense: np.ndarray, grid_count: int) -> np.ndarray:
     """Lay the masks of all levels out as one node array; a block whose voxels have no children needs no nodes."""
-    mask, terminal = np.zeros(grid_count, np.uint64), np.ones(grid_count, bool)
+    mask, terminal = bits.zeros(grid_count), np.ones(grid_count, bool)
     if not masks:
         return link_blocks(mask, terminal, grid_count)
     terminals = [_terminal(here, below) for here, below in zip(masks, [*masks[1:], None], strict=True)]

@@ -12,7 +12,7 @@ import numpy as np
 
 from . import bits
 from .grid import CELL_VOXELS
-from .topology import Topology, first_child, is_terminal
+from .topology import NODE, Topology, first_child, is_terminal
 
 __all__ = ["Atlas"]
 
@@ -38,10 +38,8 @@ class Atlas:
         self._grid_shape = np.array([t.grid_shape for t in topologies], np.int64).reshape(-1, 3)
         counts = np.array([len(t.nodes) for t in topologies], np.int64)
         self._node_count, self._first_node = counts, np.cumsum(counts) - counts
-        nodes = [t.nodes for t in topologies]
-        self._mask = np.concatenate([np.zeros(0, np.uint64), *(n["mask"] for n in nodes)]).astype(np.uint64)
-        self._child = np.concatenate([np.zeros(0, np.int64), *(first_child(n) for n in nodes)])
-        self._terminal = np.concatenate([np.zeros(0, bool), *(is_terminal(n) for n in nodes)])
+        nodes = np.concatenate([np.zeros(0, NODE), *(t.nodes for t in topologies)])
+        self._mask, self._child, self._terminal = nodes["mask"].copy(), first_child(nodes), is_terminal(nodes)
         self._order = np.lexsort((self.cells[:, 1], self.cells[:, 0]))
         self._columns, rank = np.unique(self.cells[:, 0], return_inverse=True)
         self._rows, row_rank = np.unique(self.cells[:, 1], return_inverse=True)

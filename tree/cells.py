@@ -1,0 +1,331 @@
+"""The files of one world cell: its tree, its data points and its payloads.
+
+    cell_I_J.tree           topology; written last, it lists the cell's other files with their SHA-256
+    cell_I_J.points         offset and validity of the data points
+    cell_I_J.local|sun|sky  payloads; one that the scene does not need is absent
+
+Comes in: a tree and arrays over its index space. Goes out: files that are complete or absent, and that know the
+bake, cell and tree that they belong to.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from . import container, payload, validate
+from .container import FileError
+from .topology import NODE, Topology
+
+__all__ = [
+    "PAYLOADS",
+    "Cell",
+    "cell_path",
+    "describe_file",
+    "has_cell",
+    "read_cell",
+    "read_tree",
+    "topology_hash",
+    "write_cell",
+]
+
+TREE, POINTS = "tree", "points"
+PAYLOADS = ("local", "sun", "sky")
+UNITS = {"local": "W/m2", "sun": "1", "sky": "W/m2"}
+OFFSET_STEPS = 254
+"""Offsets are stored in voxel sizes / 254: 127 is half a voxel."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Everything that a bake holds for one world cell.
+
+    Parameters
+    ----------
+    topology : Topology
+        The tree.
+    offset : (size, 3) int8
+        Data point minus voxel centre, in voxel sizes / 254.
+    valid : (size,) bool
+        Whether there is a data point: not inside a wall.
+    payloads : dict of str to Payload
+        By name.
+    meta : dict
+        Header of the tree's file.
+    """
+
+    topology: Topology
+    offset: np.ndarray
+    valid: np.ndarray
+    payloads: dict[str, payload.Payload]
+    meta: dict
+
+
+def cell_path(folder: str | os.PathLike, cell: tuple[int, int], name: str) -> Path:
+    """Return where a file of a cell lies.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Folder of the bake.
+    cell : (2,) int
+        World cell (i, j).
+    name : str
+        "tree", "points" or a payload's name.
+
+    Returns
+    -------
+    Path
+        The file's path.
+    """
+    return Path(folder) / f"cell_{cell[0]}_{cell[1]}.{name}"
+
+
+def write_cell(
+    folder: str | os.PathLike,
+    topology: Topology,
+    payloads: dict[str, np.ndarray],
+    valid: np.ndarray,
+    offsets: np.ndarray,
+    meta: dict,
+) -> dict[str, int]:
+    """Write all files of a cell, the tree last: a cell without a fitting tree counts as not baked.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Folder of the bake; it exists.
+    topology : Topology
+        The tree.
+    payloads : dict of str to (size, K, 9, 3) float32
+        Irradiance coefficients by name, "local", "sun" or "sky".
+    valid : (size,) bool
+        Which voxels have a data point.
+    offsets : (size, 3) int8
+        Data point minus voxel centre, in voxel sizes / 254.
+    meta : dict
+        Header fields; "bake" identifies what the values depend on.
+
+    Returns
+    -------
+    dict of str to int
+        Length of each file [bytes].
+
+    Raises
+    ------
+    ValueError
+        For a broken tree, unknown payloads, arrays of a wrong shape, values that are not finite.
+    OSError
+        When a file cannot be written; files written before remain and are overwritten by the next attempt.
+    """
+    valid, offsets = np.asarray(valid), np.asarray(offsets)
+    _check_cell(topology, payloads, valid, offsets)
+    cell, size = topology.cell, topology.size
+    common = {"bake": str(meta["bake"]), "cell": list(cell), "topology": topology_hash(topology)}
+    sizes = {}
+    arrays = {"offset": np.where(valid[:, None], offsets, 0).astype(np.int8), "valid": valid.astype(bool)}
+    units = {"offset": f"voxel size / {OFFSET_STEPS}"}
+    sizes[POINTS] = container.write(cell_path(folder, cell, POINTS), POINTS, arrays, common, units)
+    for name in PAYLOADS:
+        path = cell_path(folder, cell, name)
+        if name in payloads:
+            unit = "sr" if name == "sky" and payloads[name].shape[1] > 1 else UNITS[name]
+            sizes[name] = payload.write_payload(path, name, payloads[name], valid, common, unit)
+        else:
+            path.unlink(missing_ok=True)
+    listed = {name: describe_file(cell_path(folder, cell, name)) for name in sizes}
+    header = {**meta, **common, "files": listed, "data_points": size, "valid_points": int(valid.sum())}
+    header |= {"grid_min": list(topology.grid_min), "grid_shape": list(topology.grid_shape)}
+    header |= {"levels": topology.levels, "left_out": topology.left_out}
+    nodes = {"mask": topology.nodes["mask"], "link": topology.nodes["link"]}
+    sizes[TREE] = container.write(cell_path(folder, cell, TREE), TREE, nodes, header)
+    return sizes
+
+
+def topology_hash(topology: Topology) -> str:
+    """Identify a tree, so that a payload cannot be read with another one.
+
+    Parameters
+    ----------
+    topology : Topology
+        The tree.
+
+    Returns
+    -------
+    str
+        32 hexadecimal digits.
+    """
+    numbers = [*topology.cell, *topology.grid_min, *topology.grid_shape, topology.levels]
+    digest = hashlib.sha256(np.array(numbers, "<i8").tobytes())
+    digest.update(np.ascontiguousarray(topology.nodes, NODE).tobytes())
+    return digest.hexdigest()[:32]
+
+
+def read_tree(path: str | os.PathLike) -> tuple[Topology, dict]:
+    """Read a tree and check every invariant of it.
+
+    Parameters
+    ----------
+    path : str or Path
+        A `.tree` file.
+
+    Returns
+    -------
+    topology : Topology
+        The tree.
+    meta : dict
+        The file's header.
+
+    Raises
+    ------
+    FileError
+        For a damaged file, or a tree with a broken invariant, which the message names.
+    OSError
+        When the file cannot be read.
+    """
+    file = container.read(path, TREE)
+    try:
+        cell, low, shape = (_ints(file.meta[key]) for key in ("cell", "grid_min", "grid_shape"))
+        levels, left_out = _ints([file.meta["levels"], file.meta["left_out"]])
+        mask, link = file.arrays["mask"], file.arrays["link"]
+        if (len(cell), len(low), len(shape)) != (2, 3, 3) or mask.ndim != 1 or mask.shape != link.shape:
+            raise ValueError("arrays or header fields have a wrong length")
+        if (mask.dtype, link.dtype) != (NODE["mask"], NODE["link"]):
+            raise ValueError("mask and link have wrong types")
+    except (KeyError, TypeError, ValueError) as error:
+        raise FileError(path, container.PREFIX_BYTES, f"this is no tree: {error}") from None
+    nodes = np.zeros(len(mask), NODE)
+    nodes["mask"], nodes["link"] = mask, link
+    topology = Topology(cell, low, shape, nodes, levels, left_out)
+    defect = validate.first_defect(topology)
+    if defect:
+        raise FileError(path, container.PREFIX_BYTES, defect)
+    return topology, file.meta
+
+
+def read_cell(folder: str | os.PathLike, cell: tuple[int, int]) -> Cell:
+    """Read all files of a cell and check that they belong together.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Folder of the bake.
+    cell : (2,) int
+        World cell (i, j).
+
+    Returns
+    -------
+    Cell
+        The cell.
+
+    Raises
+    ------
+    FileError
+        For a damaged file, or one of another bake, cell or tree.
+    OSError
+        When a file is missing or cannot be read.
+    """
+    path = cell_path(folder, cell, TREE)
+    topology, meta = read_tree(path)
+    if topology.cell != tuple(cell):
+        raise FileError(path, container.PREFIX_BYTES, f"this is cell {topology.cell}")
+    own = {key: meta.get(key) for key in ("bake", "cell", "topology")}
+    if own["topology"] != topology_hash(topology) or not isinstance(meta.get("files"), dict):
+        raise FileError(path, container.PREFIX_BYTES, "the header does not describe this tree")
+    points = container.read(cell_path(folder, cell, POINTS), POINTS)
+    _check_belongs(cell_path(folder, cell, POINTS), points.meta, own)
+    offset, valid = points.arrays.get("offset"), points.arrays.get("valid")
+    shapes = [None if a is None else (a.shape, a.dtype.str) for a in (offset, valid)]
+    if shapes != [((topology.size, 3), "|i1"), ((topology.size,), "|b1")]:
+        reason = f"the data points do not fit a tree of {topology.size} voxels"
+        raise FileError(cell_path(folder, cell, POINTS), container.PREFIX_BYTES, reason)
+    payloads = {}
+    for name in (name for name in PAYLOADS if name in meta["files"]):
+        payloads[name], header = payload.read_payload(cell_path(folder, cell, name))
+        _check_belongs(cell_path(folder, cell, name), header, own | {"name": name})
+        if not np.array_equal(payloads[name].index != payload.NO_DATA, valid):
+            reason = "the payload has data for other voxels than the valid ones"
+            raise FileError(cell_path(folder, cell, name), container.PREFIX_BYTES, reason)
+    return Cell(topology, offset, valid, payloads, meta)
+
+
+def has_cell(folder: str | os.PathLike, cell: tuple[int, int], bake: str) -> bool:
+    """Say whether a cell is there, complete and undamaged, and belongs to a bake.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Folder of the bake.
+    cell : (2,) int
+        World cell (i, j).
+    bake : str
+        What identifies the bake.
+
+    Returns
+    -------
+    bool
+        False for anything missing, damaged or different.
+    """
+    try:
+        return read_cell(folder, cell).meta["bake"] == bake
+    except (OSError, FileError):
+        return False
+
+
+def describe_file(path: Path) -> dict:
+    """Describe a file, so that another one can vouch for it.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    dict
+        Name, length [bytes] and SHA-256.
+
+    Raises
+    ------
+    OSError
+        When the file cannot be read.
+    """
+    content = path.read_bytes()
+    return {"name": path.name, "bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+
+
+def _ints(numbers: list) -> tuple[int, ...]:
+    """Whole numbers of a header."""
+    if not isinstance(numbers, list) or any(type(number) is not int for number in numbers):
+        raise ValueError(f"{numbers!r} are not whole numbers")
+    return tuple(numbers)
+
+
+def _check_belongs(path: Path, meta: dict, own: dict) -> None:
+    """Refuse a file of another bake, cell or tree."""
+    for key, value in own.items():
+        if meta.get(key) != value:
+            reason = f"its {key} is {meta.get(key)!r}, the tree's is {value!r}: the files do not belong together"
+            raise FileError(path, container.PREFIX_BYTES, reason)
+
+
+def _check_cell(topology: Topology, payloads: dict[str, np.ndarray], valid: np.ndarray, offsets: np.ndarray) -> None:
+    """Refuse what a reader would refuse, before anything is written."""
+    defect = validate.first_defect(topology)
+    if defect:
+        raise ValueError(f"cell {topology.cell}: {defect}")
+    unknown = set(payloads) - set(PAYLOADS)
+    if unknown:
+        raise ValueError(f"unknown payloads {sorted(unknown)}; a cell has {', '.join(PAYLOADS)}")
+    size = topology.size
+    if valid.shape != (size,) or valid.dtype != bool or offsets.shape != (size, 3) or offsets.dtype != np.int8:
+        raise ValueError(
+            f"valid is {valid.dtype} {valid.shape}, offsets {offsets.dtype} {offsets.shape}; size is {size}"
+        )
+    for name, values in payloads.items():
+        if len(values) != size:
+            raise ValueError(f"payload {name} has {len(values)} rows; the tree has {size} voxels")

@@ -1,0 +1,186 @@
+"""The folder of a bake: the files of its world cells, and one `world.json` that lists them.
+
+Comes in: finished cells, in any order and from any process. Goes out: `world.json` with format, grid, bounds,
+transports, the cells with the SHA-256 of each file, and a checksum of its own. Written atomically from whatever
+cells belong to the bake, so that a bake can stop at any moment.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+
+from .atomic import write_bytes_atomically
+from .cells import TREE, Cell, cell_path, describe_file, has_cell, read_cell, read_tree, write_cell
+from .container import FileError
+from .grid import Grid
+from .topology import Topology
+
+__all__ = ["Cell", "assemble", "files", "grid_of", "has_cell", "load_header", "read_cell", "write_cell"]
+
+WORLD = "world.json"
+WORLD_FORMAT = "gi_volumes world"
+WORLD_VERSION = 1
+MAX_WORLD_BYTES = 1 << 28
+"""A `world.json` of a million cells; anything longer is not one."""
+FILE_NAME = re.compile(r"cell_(-?\d+)_(-?\d+)\.(tree|points|local|sun|sky)")
+
+
+def assemble(folder: str | os.PathLike, header: dict) -> dict:
+    """Write `world.json` from the cells that belong to a bake.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Folder of the bake.
+    header : dict
+        "bake", "grid" (a `Grid`), "transports", and whatever else to store; "expected_cells" lists the cells that
+        a finished bake has.
+
+    Returns
+    -------
+    dict
+        What `load_header` will return.
+
+    Raises
+    ------
+    OSError
+        When the folder cannot be read or written.
+    """
+    grid = header["grid"]
+    cells = []
+    for cell in _cells_in(folder):
+        try:
+            topology, meta = read_tree(cell_path(folder, cell, TREE))
+        except FileError:
+            continue
+        if meta.get("bake") == header["bake"] and topology.cell == cell:
+            cells.append(_describe_cell(folder, topology, meta, grid))
+    lattice = dataclasses.asdict(grid) | {"cell_size": grid.cell_size, "unit": "m"}
+    content = header | {"format": WORLD_FORMAT, "version": WORLD_VERSION, "grid": lattice, "cells": cells}
+    content["bounds"] = _bounds([entry["bounds"] for entry in cells])
+    content = json.loads(json.dumps(content, allow_nan=False))
+    content["checksum"] = _checksum(content)
+    write_bytes_atomically(Path(folder) / WORLD, json.dumps(content, indent=1, sort_keys=True).encode() + b"\n")
+    return content
+
+
+def load_header(folder: str | os.PathLike) -> dict:
+    """Read `world.json`.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Folder of the bake.
+
+    Returns
+    -------
+    dict
+        Its content.
+
+    Raises
+    ------
+    FileError
+        When it is damaged, changed by hand, or of another version.
+    OSError
+        When it is missing or cannot be read.
+    """
+    path = Path(folder) / WORLD
+    if path.stat().st_size > MAX_WORLD_BYTES:
+        raise FileError(path, 0, "the file is too long for a world.json")
+    try:
+        content = json.loads(path.read_bytes())
+    except (ValueError, RecursionError) as error:
+        reason = " ".join(str(error).split())
+        raise FileError(path, getattr(error, "pos", 0), f"this is not JSON: {reason}") from None
+    if not isinstance(content, dict) or content.get("format") != WORLD_FORMAT:
+        raise FileError(path, 0, "this is not the world.json of a bake")
+    if content.get("version") != WORLD_VERSION:
+        raise FileError(path, 0, f"format version {content.get('version')}; this program reads {WORLD_VERSION}")
+    if content.get("checksum") != _checksum(content):
+        raise FileError(path, 0, "the checksum is wrong: the file is damaged or was changed by hand")
+    return content
+
+
+def grid_of(header: dict) -> Grid:
+    """Return the lattice of a bake.
+
+    Parameters
+    ----------
+    header : dict
+        From `load_header`.
+
+    Returns
+    -------
+    Grid
+        The lattice.
+    """
+    lattice = header["grid"]
+    return Grid(lattice["first_size"], lattice["levels"], tuple(lattice["origin"]))
+
+
+def files(folder: str | os.PathLike) -> list[Path]:
+    """List the files of a bake in a folder, and leftovers of interrupted ones; other files are not listed.
+
+    Parameters
+    ----------
+    folder : str or Path
+        The folder; it may be missing.
+
+    Returns
+    -------
+    list of Path
+        `world.json`, the snapshot `scene.giv` and the cells' files, sorted.
+
+    Raises
+    ------
+    OSError
+        When the folder cannot be read.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        return []
+    return sorted(path for path in folder.iterdir() if path.is_file() and _is_ours(path.name))
+
+
+def _is_ours(name: str) -> bool:
+    """Whether a bake writes files of this name; temporary ones carry the name they will get."""
+    temporary = re.fullmatch(r"\.(.+)\.[0-9a-f]{32}\.tmp", name)
+    name = temporary[1] if temporary else name
+    return name in (WORLD, "scene.giv") or FILE_NAME.fullmatch(name) is not None
+
+
+def _cells_in(folder: str | os.PathLike) -> list[tuple[int, int]]:
+    """Cells that have a tree file, sorted."""
+    names = (FILE_NAME.fullmatch(name) for name in os.listdir(folder))
+    return sorted({(int(match[1]), int(match[2])) for match in names if match and match[3] == TREE})
+
+
+def _describe_cell(folder: str | os.PathLike, topology: Topology, meta: dict, grid: Grid) -> dict:
+    """A cell's entry in `world.json`."""
+    low = np.array(topology.grid_min) * grid.first_size + grid.origin
+    high = low + np.array(topology.grid_shape) * grid.first_size
+    listed = meta["files"] | {TREE: describe_file(cell_path(folder, topology.cell, TREE))}
+    keys = ("data_points", "valid_points", "left_out")
+    entry = {"cell": list(topology.cell), "bounds": [low.tolist(), high.tolist()], "files": listed}
+    return entry | {key: meta[key] for key in keys}
+
+
+def _bounds(boxes: list) -> list | None:
+    """Box around boxes; None without any."""
+    if not boxes:
+        return None
+    boxes = np.array(boxes)
+    return [boxes[:, 0].min(axis=0).tolist(), boxes[:, 1].max(axis=0).tolist()]
+
+
+def _checksum(content: dict) -> str:
+    """SHA-256 of everything else in a `world.json`, independent of white space."""
+    rest = {key: value for key, value in content.items() if key != "checksum"}
+    return hashlib.sha256(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode()).hexdigest()

@@ -1,0 +1,305 @@
+"""A bake, loaded: irradiance at any point for any normal. This is the definition of what the files mean.
+
+    E(p, n) = E_local(p, n) + E_sun(p, n; sun direction) * sun irradiance + E_sky(p, n; sky radiance)   [W/m2]
+
+Comes in: a folder, then points and normals. Goes out: irradiance, finite and not negative everywhere. Each of the
+three terms is clamped at 0 by itself, so that they add up whether they are asked for together or one by one.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from . import folder, harmonics, payload
+from .container import FileError
+from .grid import Grid
+from .interpolate import DataPoints, weigh
+from .lookup import Atlas
+from .suns import SunKeys
+
+__all__ = ["TRANSPORTS", "World", "load"]
+
+TRANSPORTS = ("all", "local", "sun", "sky")
+CHUNK = 1 << 15
+"""Points handled at a time: about 100 MB of temporaries."""
+
+
+@dataclass(frozen=True)
+class Values:
+    """One payload over all cells.
+
+    Parameters
+    ----------
+    entry : (n,) int64
+        Row of the table for each global index, -1 without data.
+    table : (m, K, 9, 3) float16
+        Entries of all cells.
+    scale : (m,) float64
+        Unit of each entry.
+    """
+
+    entry: np.ndarray
+    table: np.ndarray
+    scale: np.ndarray
+
+
+class World:
+    """A baked folder.
+
+    Parameters
+    ----------
+    header : dict
+        Content of `world.json`.
+    cells : list of Cell
+        All cells of the bake.
+
+    Attributes
+    ----------
+    header : dict
+        Content of `world.json`.
+    grid : Grid
+        The lattice; `grid.origin` is where local metres start.
+    cells : (n, 2) int64
+        World cells (i, j) that are there.
+    """
+
+    def __init__(self, header: dict, cells: list[folder.Cell]):
+        self.header, self.grid = header, folder.grid_of(header)
+        self.cells = np.array([cell.topology.cell for cell in cells], np.int64).reshape(-1, 2)
+        self._data = _data_points(self.grid, cells)
+        names = [name for name in TRANSPORTS[1:] if any(name in cell.payloads for cell in cells)]
+        self._values = {name: _join(name, cells, self._data.atlas) for name in names}
+        sun = header.get("transports", {}).get("sun") or {}
+        self._keys = SunKeys(np.array(sun["directions"])) if sun.get("directions") else None
+        own = sun.get("scene") or []
+        self._own_direction = np.array([entry["direction"] for entry in own], np.float64).reshape(-1, 3)
+        self._own_irradiance = np.array([entry["irradiance"] for entry in own], np.float64).reshape(-1, 3)
+
+    @property
+    def sun_irradiance(self) -> np.ndarray:
+        """(3,) float64 irradiance of the scene's own suns together, on surfaces that face them [W/m2]."""
+        return self._own_irradiance.sum(axis=0) if len(self._own_irradiance) else np.ones(3)
+
+    def irradiance(
+        self,
+        points: np.ndarray,
+        normals: np.ndarray,
+        sun: tuple | None = None,
+        sky: np.ndarray | float | None = None,
+        transport: str = "all",
+    ) -> np.ndarray:
+        """Return irradiance.
+
+        Parameters
+        ----------
+        points : (n, 3) float64
+            World space [m]; anywhere, also outside the bake.
+        normals : (n, 3) float
+            Away from the surface, of any length; zero gives the mean over all directions.
+        sun : (direction, irradiance), optional
+            Direction to the sun, and its irradiance on a surface that faces it, a number or (3,) [W/m2]; the
+            scene's own suns when None.
+        sky : float, (3,) or (9, 3), optional
+            Factor of the scene's own sky, or the harmonics of another sky's radiance [W/(m2 sr)], for a bake that
+            holds the response to them; the scene's own sky when None.
+        transport : str
+            "all"; "local" or "sky" alone; or "sun" alone, per 1 W/m2 of sun irradiance.
+
+        Returns
+        -------
+        (n, 3) float32
+            Irradiance [W/m2], finite and not negative. A transport that the bake does not have is 0.
+
+        Raises
+        ------
+        ValueError
+            For wrong shapes, input that is not finite, an unknown transport, a sky that the bake cannot represent.
+
+        Notes
+        -----
+        Error: bounded by what is stored; see `docs/accuracy.md`.
+        Source: the talk's rows 9 and 10.
+        """
+        points, normals = _check_rows(points, "points"), _unit(_check_rows(normals, "normals"))
+        if len(points) != len(normals):
+            raise ValueError(f"{len(points)} points and {len(normals)} normals; as many are needed")
+        factors = self._factors(sun, sky, transport)
+        result = np.zeros((len(points), 3), np.float32)
+        for start in range(0, len(points), CHUNK):
+            part = slice(start, start + CHUNK)
+            result[part] = self._evaluate(self.grid.to_local(points[part]), normals[part], factors)
+        return result
+
+    def _evaluate(self, points: np.ndarray, normals: np.ndarray, factors: dict[str, np.ndarray]) -> np.ndarray:
+        """One chunk: weights once, then each transport."""
+        row, weight = weigh(self._data, points, normals)
+        functions = harmonics.basis(normals)
+        functions[~normals.any(axis=1), 1:] = 0.0
+        total = np.zeros((len(points), 3), np.float32)
+        for name, factor in factors.items():
+            total += np.maximum(_sum(self._values[name], factor, row, weight, functions), 0.0)
+        return np.nan_to_num(total, nan=0.0, posinf=float(np.finfo(np.float32).max))
+
+    def _factors(self, sun: tuple | None, sky: np.ndarray | float | None, transport: str) -> dict[str, np.ndarray]:
+        """(K, 3) factors of the functions of each transport that counts."""
+        if transport not in TRANSPORTS:
+            raise ValueError(f"transport {transport!r}; one of {', '.join(TRANSPORTS)} is needed")
+        sun_factor, sky_factor = self._sun_factor(sun, transport == "sun"), self._sky_factor(sky)
+        chosen = {"local": np.ones((1, 3)), "sun": sun_factor, "sky": sky_factor}
+        return {k: v for k, v in chosen.items() if k in self._values and transport in ("all", k)}
+
+    def _sun_factor(self, sun: tuple | None, per_unit: bool) -> np.ndarray | None:
+        """Weights of the sun keys; relative to the suns' irradiance if asked for."""
+        if sun is None:
+            direction, irradiance = self._own_direction, self._own_irradiance
+        else:
+            direction = _finite(sun[0], "sun direction").reshape(-1, 3)
+            irradiance = np.broadcast_to(_finite(sun[1], "sun irradiance"), (len(direction), 3))
+        if (irradiance < 0).any():
+            raise ValueError("the sun's irradiance is negative")
+        if "sun" not in self._values or self._keys is None:
+            return None
+        if per_unit and not len(direction):
+            raise ValueError("the bake has no sun of its own; name its direction")
+        if per_unit:
+            total = irradiance.sum(axis=0)
+            irradiance = np.where(total > 0, irradiance / np.where(total > 0, total, 1.0), 1.0 / len(direction))
+        index, weight = self._keys.interpolate(direction)
+        factor = np.zeros((len(self._keys.directions), 3))
+        for corner in range(3):
+            for channel in range(3):
+                part = weight[:, corner] * irradiance[:, channel]
+                factor[:, channel] += np.bincount(index[:, corner], part, len(factor))
+        return factor
+
+    def _sky_factor(self, sky: np.ndarray | float | None) -> np.ndarray | None:
+        """Weights of the sky's functions."""
+        values = self._values.get("sky")
+        given = None if sky is None else _finite(sky, "sky")
+        if values is None:
+            return None
+        count = values.table.shape[1]
+        own = self.header["transports"]["sky"].get("radiance") if count > 1 else [[1.0, 1.0, 1.0]]
+        if given is None:
+            return np.array(own, np.float64)
+        if given.shape in ((), (1,), (3,)):
+            return np.array(own, np.float64) * given
+        if given.shape != (count, 3) or count == 1:
+            raise ValueError(f"a sky of shape {given.shape}; this bake takes a factor" + " or (9, 3)" * (count > 1))
+        return given
+
+
+def load(path: str | os.PathLike) -> World:
+    """Load a bake.
+
+    Parameters
+    ----------
+    path : str or Path
+        The folder.
+
+    Returns
+    -------
+    World
+        The bake, with every cell in memory.
+
+    Raises
+    ------
+    FileError
+        For a file that is damaged or does not belong to the bake.
+    OSError
+        For a folder or file that is missing or cannot be read.
+    """
+    header = folder.load_header(path)
+    cells = []
+    for entry in header["cells"]:
+        cell = folder.read_cell(path, tuple(entry["cell"]))
+        if cell.meta["bake"] != header["bake"]:
+            name = f"cell_{entry['cell'][0]}_{entry['cell'][1]}.tree"
+            raise FileError(os.path.join(path, name), 0, "this cell is of another bake than world.json")
+        cells.append(cell)
+    return World(header, cells)
+
+
+def _data_points(grid: Grid, cells: list[folder.Cell]) -> DataPoints:
+    """Join the data points of all cells."""
+    topologies = [cell.topology for cell in cells]
+    atlas = Atlas(topologies)
+    offset = np.concatenate([np.zeros((0, 3), np.int8), *(cell.offset for cell in cells)])
+    valid = np.concatenate([np.zeros(0, bool), *(cell.valid for cell in cells)])
+    low = np.array([t.grid_min for t in topologies], np.float64).reshape(-1, 3)
+    high = low + np.array([t.grid_shape for t in topologies], np.float64).reshape(-1, 3)
+    rows, centers = [np.zeros(0, np.int64)], [np.zeros((0, 3))]
+    for cell, first in zip(cells, atlas.first[:-1], strict=True):
+        kept = np.flatnonzero(cell.valid[: cell.topology.grid_count])
+        rows.append(kept + first)
+        centers.append((cell.topology.voxels()[1][kept] + 0.5) * grid.first_size)
+    boxes = np.stack([low, high], axis=1) * grid.first_size
+    return DataPoints(grid, atlas, offset, valid, np.concatenate(rows), np.concatenate(centers), boxes)
+
+
+def _join(name: str, cells: list[folder.Cell], atlas: Atlas) -> Values:
+    """One table over all cells; a cell without the payload has no data."""
+    present = [cell.payloads[name] for cell in cells if name in cell.payloads]
+    if len({p.table.shape[1] for p in present}) != 1:
+        raise ValueError(f"the cells hold different numbers of functions in their {name} payloads")
+    entry, start = np.full(atlas.first[-1], -1), 0
+    for cell, first in zip(cells, atlas.first[:-1], strict=True):
+        if name in cell.payloads:
+            index = cell.payloads[name].index.astype(np.int64)
+            entry[first : first + len(index)] = np.where(index == payload.NO_DATA, -1, index + start)
+            start += len(cell.payloads[name].table)
+    scale = np.concatenate([np.full(len(p.table), p.scale) for p in present])
+    return Values(entry, np.concatenate([p.table for p in present]), scale)
+
+
+def _sum(values: Values, factor: np.ndarray, row: np.ndarray, weight: np.ndarray, functions: np.ndarray) -> np.ndarray:
+    """(n, 3) weighted sum over data points, functions and harmonics; entries are unpacked once each."""
+    entry = values.entry[row]
+    used, place = np.unique(np.where((entry >= 0) & (weight > 0), entry, -1), return_inverse=True)
+    place = place.reshape(row.shape)
+    coefficients = np.zeros((len(used), 9 * 3), np.float32)
+    for part in _unpack(values, factor, used[used >= 0]):
+        coefficients[used >= 0] += part
+    sums = np.zeros((len(row), 27), np.float32)
+    weight = weight.astype(np.float32)
+    for corner in range(8):
+        sums += weight[:, corner, None] * coefficients[place[:, corner]]
+    return np.einsum("nk,nkc->nc", functions, sums.reshape(-1, 9, 3))
+
+
+def _unpack(values: Values, factor: np.ndarray, entries: np.ndarray) -> Iterator[np.ndarray]:
+    """(m, 27) float32 share of each function that counts."""
+    for function in np.flatnonzero(factor.any(axis=1)):
+        table = values.table[entries, function].astype(np.float64) * values.scale[entries, None, None]
+        yield (table * factor[function]).reshape(-1, 27).astype(np.float32)
+
+
+def _check_rows(values: np.ndarray, what: str) -> np.ndarray:
+    """(n, 3) finite float64."""
+    values = np.asarray(values, np.float64)
+    if values.ndim != 2 or values.shape[1] != 3:
+        raise ValueError(f"{what} have shape {values.shape}; (n, 3) is needed")
+    bad = ~np.isfinite(values).all(axis=1)
+    if bad.any():
+        raise ValueError(f"{what}: row {int(np.argmax(bad))} is not finite")
+    return values
+
+
+def _finite(value: object, what: str) -> np.ndarray:
+    """A finite float64 array."""
+    value = np.asarray(value, np.float64)
+    if not np.isfinite(value).all():
+        raise ValueError(f"the {what} is not finite")
+    return value
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    """Unit vectors; zero stays zero, and no length overflows."""
+    largest = np.abs(vectors).max(axis=1, keepdims=True)
+    vectors = vectors / np.where(largest > 0, largest, 1.0)
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return vectors / np.where(length > 0, length, 1.0)
