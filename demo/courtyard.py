@@ -18,7 +18,7 @@ from gi_volumes.demo.stage import show
 from mathutils import Vector
 
 SUN_IRRADIANCE = 5.0
-"""On a surface that faces the sun [W/m2]: about 7 times what the sky gives the ground in the court."""
+"""On a surface that faces the sun [W/m2]."""
 SUN_ANGLE = math.radians(0.53)
 SUN_ELEVATION, SUN_AZIMUTH = math.radians(34), math.radians(224)
 """Azimuth from north towards east: from the south-west, low enough to reach the walls of two galleries."""
