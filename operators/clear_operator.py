@@ -32,6 +32,8 @@ class GIVOLUMES_OT_clear(bpy.types.Operator):
         try:
             place = properties.output_folder(context.scene)
             files = folder.files(place)
+            if place / folder.WORLD in files:
+                folder.load_header(place)  # refuses another program's file of that name
             for file in files:
                 file.unlink(missing_ok=True)
         except (OSError, ValueError) as error:

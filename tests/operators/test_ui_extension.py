@@ -172,3 +172,20 @@ left = sorted(path.name for path in output.iterdir())
 assert left == ["mine.tree", "mine.txt"], left
 assert bpy.ops.gi_volumes.clear() == {"FINISHED"}
 """)
+
+
+def test_clear_refuses_a_folder_whose_world_file_is_another_programs(blender):
+    said = blender("""
+addon_utils.enable(NAME, default_set=True)
+bpy.context.scene.gi_volumes.output_folder = str(output)
+output.mkdir()
+(output / "world.json").write_text('{"name": "a level of a game"}')
+(output / "scene.giv").write_text("x")
+try:
+    bpy.ops.gi_volumes.clear()
+except RuntimeError as error:
+    print("REFUSED", " ".join(str(error).split()))
+print(sorted(path.name for path in output.iterdir()))
+""")
+    assert "this is not the world.json of a bake" in said
+    assert "['scene.giv', 'world.json']" in said
