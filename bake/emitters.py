@@ -39,6 +39,8 @@ class Emitters:
         length = np.linalg.norm(normal, axis=1)
         self._normal = np.ascontiguousarray((normal / np.maximum(length, 1e-30)[:, None]).T.astype(np.float32))
         power = _mean_emission(surfaces, self._rows) * length / 2
+        if not power.any():
+            power = length / 2  # a texture's bright spots lie between the probes: still emitters, found by area
         total = float(power.sum())
         self.count = len(self._rows) if total > 0 else 0
         self._cdf = np.cumsum(power / total) if self.count else np.zeros(0)

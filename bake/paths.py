@@ -22,6 +22,9 @@ ROULETTE_START = 3
 PASS_LIMIT = 32
 """Transparent surfaces that one ray may cross; the next one is taken as opaque."""
 
+MET_WHERE_EMISSIVE = np.float32(0.5)
+"""Paths stop at an emissive surface at least this often, times its coverage: clear glass may shine."""
+
 TARGET_SHORTENED = np.float32(0.9999)
 """Shadow rays stop short of the surface they aim at by this share."""
 
@@ -212,7 +215,7 @@ def _pass_through(scene: Scene, wave: Wave, hits: Hits, numbers: Numbers, bounce
             break
         triangle, u, v = hits.triangle[active], hits.u[active], hits.v[active]
         passed, covered = scene.surfaces.through(triangle, u, v)
-        chance = passed.mean(axis=0)
+        chance = np.minimum(passed.mean(axis=0), 1 - MET_WHERE_EMISSIVE * covered * scene.surfaces.emissive[triangle])
         dimension = HASHED + bounce * HASHED_PER_VERTEX + PASS + step
         passes = numbers.draw(wave.lane[active], dimension, 1)[0] < chance
         stays = active[~passes]
