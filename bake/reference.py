@@ -76,8 +76,8 @@ def irradiance(
     normals : (n, 3) ndarray
         Unit normals.
     transport : str
-        "local", "sky", "sun" (per W/m2 of sun irradiance, of the first sun), or "all", which is their sum with
-        every sun at its own strength.
+        "local", "sky", "sun" (per W/m2 that all suns together bring on surfaces facing them), or "all", which is
+        their sum with every sun at its own strength.
     samples, bounces, seed : int
         As in `Effort`.
     settings : Settings, optional
@@ -131,7 +131,10 @@ def total(snapshot: Snapshot, scene: Scene, found: Gathered, transport: str) -> 
     if transport in ("local", "all") and len(found.local):
         out += found.local[:, 0]
     if transport in ("sun", "all") and len(found.sun):
-        out += found.sun[:, 0, 0] if transport == "sun" else combine_suns(snapshot, found.sun[:, :, 0])
+        strength = sun_strength(snapshot, found.sun.shape[1])
+        if transport == "sun":
+            strength = strength / np.maximum(strength.sum(axis=0), 1e-30)
+        out += np.einsum("nkc,kc->nc", found.sun[:, :, 0], strength).astype(np.float32)
     if transport in ("sky", "all") and len(found.sky):
         response = found.sky[:, :, 0]
         weights = scene.sky.harmonics() if scene.model.sky == "harmonics" else np.ones((1, 3))
@@ -144,23 +147,21 @@ def _folded(snapshot: Snapshot) -> str:
     return "fixed" if (snapshot.sky > 0).any() else "none"
 
 
-def combine_suns(snapshot: Snapshot, per_key: np.ndarray) -> np.ndarray:
-    """Weigh each sun key by the irradiance of the scene's own sun.
+def sun_strength(snapshot: Snapshot, keys: int) -> np.ndarray:
+    """Irradiance of the scene's own suns, for each sun key.
 
     Parameters
     ----------
     snapshot : Snapshot
-        The scene; keys other than its suns take the first sun's strength, or 1 W/m2 without one.
-    per_key : (n, keys, 3) float32 ndarray
-        Irradiance per W/m2 of sun.
+        The scene.
+    keys : int
+        Number of sun keys; where they are not the scene's suns, all take the first sun's strength, or 1 W/m2.
 
     Returns
     -------
-    (n, 3) float32 ndarray
-        Irradiance [W/m2].
+    (keys, 3) float64 ndarray
+        Irradiance on a surface that faces the sun [W/m2].
     """
     lights = snapshot.lights
-    strength = lights.strength[(lights.kind == LightKind.SUN) & (lights.strength > 0).any(axis=1)]
-    if len(strength) != per_key.shape[1]:
-        strength = np.broadcast_to(strength[:1] if len(strength) else np.ones((1, 3)), (per_key.shape[1], 3))
-    return np.einsum("nkc,kc->nc", per_key, strength).astype(np.float32)
+    own = lights.strength[(lights.kind == LightKind.SUN) & (lights.strength > 0).any(axis=1)].astype(np.float64)
+    return own if len(own) == keys else np.broadcast_to(own[:1] if len(own) else np.ones((1, 3)), (keys, 3))
