@@ -23,6 +23,9 @@ CANDIDATES = 8
 NEAREST = np.float32(1e-3)
 """Closer than this fraction of a metre a lamp's irradiance is held: a point lamp on a surface stays finite."""
 
+INSIDE = np.float32(0.01)
+"""Least of 1 - (r / d)^2: a point on or inside a spherical lamp gets a finite, wide disk."""
+
 
 @dataclass(frozen=True)
 class LampSample:
@@ -133,19 +136,24 @@ class Lamps:
         return np.where(round_lamp, first[0], second[0]), np.where(round_lamp, first[1], second[1])
 
     def _evaluate_round(self, lamp, center, u1, u2) -> tuple[np.ndarray, np.ndarray]:
-        """Points and spots: a disk that always faces the surface, of the lamp's radius."""
+        """Points and spots: a disk that always faces the surface.
+
+        A disk of the lamp's radius brings I / (d^2 + r^2), Blender's soft falloff. The disk that covers as much of
+        the hemisphere as a sphere of that radius is wider and brings I / d^2.
+        """
         distance = np.maximum(np.sqrt(warp.dot(center, center)), NEAREST)
         axis = center / distance
-        toward = center
-        radius = self._size[0, lamp]
+        toward, wider = center, np.float32(1)
+        radius, is_sphere = self._size[:, lamp]
         if radius.any():
+            outside = np.maximum(1 - (radius / distance) ** 2, INSIDE)
+            wider = np.where(is_sphere > 0, 1 / outside, np.float32(1))
             x, y = warp.disk(u1, u2)
             tangent, bitangent = warp.frame(axis)
-            toward = center + (tangent * x + bitangent * y) * np.minimum(radius, distance)
+            toward = center + (tangent * x + bitangent * y) * (radius * np.sqrt(wider))
         squared = np.maximum(warp.dot(toward, toward), NEAREST * NEAREST)
         facing = warp.dot(toward, axis) / np.sqrt(squared)
-        falloff = np.maximum(facing, 0) / squared * self._cone(lamp, axis)
-        return toward, falloff
+        return toward, wider * np.maximum(facing, 0) / squared * self._cone(lamp, axis)
 
     def _cone(self, lamp: np.ndarray, axis: np.ndarray) -> np.ndarray:
         """Blender's spot: a smooth step in the cosine, over the blend."""

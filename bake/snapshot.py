@@ -127,8 +127,8 @@ class Lights:
     strength : (n, 3) float32; point and spot: radiant intensity [W/sr] (on the axis of a spot); rectangle
         and ellipse: radiance [W/(m2 sr)] of the side it shines to; sun: irradiance on a surface that faces
         it [W/m2]
-    size : (n, 2) float32; point and spot: (radius [m], 0); rectangle and ellipse: full width along x and
-        height along y [m]; sun: (angular diameter [rad], 0)
+    size : (n, 2) float32; point and spot: (radius [m], 0 for soft falloff I / (d^2 + r^2), 1 for a sphere's I / d^2);
+        rectangle and ellipse: full width along x and height along y [m]; sun: (angular diameter [rad], 0)
     spot : (n, 2) float32, (cosine of half the cone, blend 0..1); (-1, 0) for other lamps
     reflector : (n,) bool, baked only: its direct light is part of the local transport
     shadow : (n,) bool, whether it casts shadows

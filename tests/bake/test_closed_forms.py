@@ -182,6 +182,18 @@ def test_a_reflector_s_direct_light_is_local_light_and_another_lamp_s_is_not():
         assert found == pytest.approx(truth, rel=1e-4)
 
 
+@pytest.mark.parametrize(("sphere", "power"), [(0, lambda d, r: d * d + r * r), (1, lambda d, r: d * d)])
+def test_a_lamp_with_a_radius_falls_off_softly_or_like_a_sphere(sphere, power):
+    distance, radius = 0.5, 0.2
+    lamp = {"position": (0, 0, distance), "size": (radius, sphere), "reflector": True}
+    speck = build_scenes.plane(1e-3, -50.0)
+    scene = prepare(build_scenes.snapshot([(speck, material())], build_scenes.lamps(lamp)), Model())
+    found = repeats(scene, SurfacePoints(columns((0, 0, 1))), columns((0, 0, 0)), 1024, 0, "local")[:, 0, 0, 0]
+    truth = 1 / power(distance, radius)
+    assert abs(z_scores(found, truth)) < STANDARD_ERRORS
+    assert abs(z_scores(found * 1.01, truth)) > STANDARD_ERRORS
+
+
 def test_many_lamps_drawn_by_power_bring_the_same_light_as_weighing_them_all():
     rng = np.random.default_rng(3)
     rows = [
