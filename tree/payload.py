@@ -68,7 +68,7 @@ class Payload:
         """
         values = np.zeros((len(self.index), *self.table.shape[1:]), np.float32)
         known = self.index != NO_DATA
-        values[known] = self.table[self.index[known]] * np.float64(self.scale)
+        values[known] = self.table[self.index[known]].astype(np.float64) * self.scale
         return values
 
 
@@ -109,7 +109,7 @@ def quantize(values: np.ndarray, valid: np.ndarray, name: str = "payload") -> Pa
     largest = float(np.abs(kept).max(initial=0.0))
     exponent = math.frexp(largest)[1] - TOP_EXPONENT if largest > 0 else 0
     entries = (kept * 2.0**-exponent).astype(np.float16) + np.float16(0)
-    first, rank = _distinct(entries.reshape(len(entries), -1))
+    first, rank = _distinct(entries.reshape(len(entries), int(np.prod(entries.shape[1:]))))
     if len(first) > NO_DATA:
         raise ValueError(f"{name}: {len(first)} distinct entries; 16 bits number at most {NO_DATA}")
     index = np.full(len(values), NO_DATA, np.uint16)
