@@ -26,6 +26,9 @@ TILE_LANES = 65536
 BLOCK_SAMPLES = 1024
 """Most samples of a point in one wavefront; part of the result's definition, as it orders the sums."""
 
+SUMMED_SAMPLES = 32
+"""Samples in one matrix product; larger products start threads of OpenBLAS, which change the last bits of the sums."""
+
 DIRECT_DIMENSIONS = paths.HASHED - 64
 """Random numbers of the direct light at the point itself, apart from every path vertex's."""
 
@@ -195,10 +198,14 @@ def _gather_block(scene: Scene, sensor: Sensor, position, rows, sampler: Sampler
 
 
 def _project(weights: np.ndarray, values: np.ndarray, points: int, count: int) -> np.ndarray:
-    """(points, responses, channels) sums over samples, as one matrix product for each point."""
+    """(points, responses, channels) sums over samples, as matrix products of a few samples of each point."""
     left = np.ascontiguousarray(weights.reshape(-1, points, count).transpose(1, 0, 2))
     right = np.ascontiguousarray(values.reshape(-1, points, count).transpose(1, 2, 0))
-    return (left @ right).astype(np.float64)
+    total = np.zeros((points, left.shape[1], right.shape[2]))
+    for first in range(0, count, SUMMED_SAMPLES):
+        part = slice(first, first + SUMMED_SAMPLES)
+        total += left[:, :, part] @ right[:, part]
+    return total
 
 
 def _direct(scene: Scene, sensor: Sensor, position, rows, numbers: Numbers, lanes):
