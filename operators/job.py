@@ -161,12 +161,33 @@ def summary(result: dict) -> str:
     if "data_points" in result:
         parts.append(f"{result['data_points']:,} data points")
     if result.get("bytes"):
-        parts.append(f"{sum(result['bytes'].values()) / 1e6:.1f} MB")
+        parts.append(size(sum(result["bytes"].values())))
     text = ", ".join(parts)
     seconds = result.get("seconds") or {}
     if seconds:
-        text += f" in {duration(seconds.get('total', sum(seconds.values())))}"
+        text += f" in {duration(sum(seconds.values()))}"
     return f"Baked {text}".strip()
+
+
+def size(count: int) -> str:
+    """Return an amount of data as people say it.
+
+    Parameters
+    ----------
+    count : int
+        Bytes.
+
+    Returns
+    -------
+    str
+        For example "12 kB" or "3.4 MB".
+
+    Examples
+    --------
+    >>> size(12_345), size(3_400_000)
+    ('12 kB', '3.4 MB')
+    """
+    return f"{count / 1e6:.1f} MB" if count >= 1e6 else f"{count / 1e3:.0f} kB"
 
 
 current: Job | None = None

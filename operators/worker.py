@@ -54,13 +54,15 @@ def duration(seconds: float) -> str:
     Returns
     -------
     str
-        For example "45 s", "3 min 5 s" or "2 h 10 min".
+        For example "0.4 s", "45 s", "3 min 5 s" or "2 h 10 min".
 
     Examples
     --------
-    >>> duration(45.4), duration(185), duration(7800)
-    ('45 s', '3 min 5 s', '2 h 10 min')
+    >>> duration(0.43), duration(45.4), duration(185), duration(7800)
+    ('0.4 s', '45 s', '3 min 5 s', '2 h 10 min')
     """
+    if seconds < 1:
+        return f"{seconds:.1f} s"
     whole = round(seconds)
     if whole < 60:
         return f"{whole} s"

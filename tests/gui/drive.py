@@ -42,6 +42,12 @@ def start(quality: str, output: str):
     return job().current
 
 
+def add_slow_mesh() -> None:
+    """Something that takes long enough to bake to be cancelled: curved, and larger than the finest voxels."""
+    with bpy.context.temp_override(**view()):
+        bpy.ops.mesh.primitive_torus_add(major_radius=30.0, minor_radius=12.0, major_segments=96, minor_segments=48)
+
+
 def job():
     """The module that knows the current bake."""
     return sys.modules[f"{NAME}.operators.job"]
@@ -69,9 +75,16 @@ def scenario():
     yield
     picture("1_panel")
 
+    running = start("draft", "finished")
+    yield from until(lambda: job().current is None, running)
+    seen["steps"].append(["finish", job().last.kind])
+    seen["message"] = job().last.message
+    picture("2_finished")
+
+    add_slow_mesh()
     running = start("final", "cancelled")
     yield from until(lambda: running.progress.stage == "Baking" and running.progress.fraction > 0, running)
-    picture("2_progress")
+    picture("3_progress")
     assert not bpy.ops.gi_volumes.bake.poll()
     where["window"].event_simulate(type="ESC", value="PRESS", x=300, y=300)
     yield from until(lambda: job().current is None, running)
@@ -83,13 +96,7 @@ def scenario():
     bpy.ops.gi_volumes.cancel()
     yield from until(lambda: job().current is None, running)
     seen["steps"].append(["cancel", job().last.kind])
-    picture("3_cancelled")
-
-    running = start("draft", "finished")
-    yield from until(lambda: job().current is None, running)
-    seen["steps"].append(["finish", job().last.kind])
-    seen["message"] = job().last.message
-    picture("4_finished")
+    picture("4_cancelled")
 
     running = start("final", "disabled")
     yield from until(lambda: running.progress.stage == "Baking", running)
@@ -97,6 +104,7 @@ def scenario():
     yield
     yield
     bpy.ops.preferences.addon_enable(module=NAME)
+    yield
     seen["steps"].append(["disable", "alive"])
     picture("5_enabled_again")
 

@@ -71,9 +71,9 @@ def test_an_artist_bakes_in_the_window_cancels_and_bakes_to_the_end(blender, arc
     seen = json.loads((tmp_path / "seen.json").read_text())
     assert seen.get("done"), f"{seen.get('error')}\n{said}\npictures: {tmp_path}"
     assert seen["steps"] == [
+        ["finish", "done"],
         ["escape", "stopped"],
         ["cancel", "stopped"],
-        ["finish", "done"],
         ["disable", "alive"],
         ["another file", "stopped"],
     ]
