@@ -67,7 +67,7 @@ def assemble(folder: str | os.PathLike, header: dict) -> dict:
     content["bounds"] = _bounds([entry["bounds"] for entry in cells])
     content = json.loads(json.dumps(content, allow_nan=False))
     content["checksum"] = _checksum(content)
-    write_bytes_atomically(Path(folder) / WORLD, json.dumps(content, indent=1, sort_keys=True).encode() + b"\n")
+    write_bytes_atomically(Path(folder) / WORLD, _to_text(content))
     return content
 
 
@@ -94,8 +94,9 @@ def load_header(folder: str | os.PathLike) -> dict:
     path = Path(folder) / WORLD
     if path.stat().st_size > MAX_WORLD_BYTES:
         raise FileError(path, 0, "the file is too long for a world.json")
+    text = path.read_bytes()
     try:
-        content = json.loads(path.read_bytes())
+        content = json.loads(text)
     except (ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise FileError(path, getattr(error, "pos", 0), f"this is not JSON: {reason}") from None
@@ -103,7 +104,7 @@ def load_header(folder: str | os.PathLike) -> dict:
         raise FileError(path, 0, "this is not the world.json of a bake")
     if content.get("version") != WORLD_VERSION:
         raise FileError(path, 0, f"format version {content.get('version')}; this program reads {WORLD_VERSION}")
-    if content.get("checksum") != _checksum(content):
+    if content.get("checksum") != _checksum(content) or text != _to_text(content):
         raise FileError(path, 0, "the checksum is wrong: the file is damaged or was changed by hand")
     return content
 
@@ -180,7 +181,12 @@ def _bounds(boxes: list) -> list | None:
     return [boxes[:, 0].min(axis=0).tolist(), boxes[:, 1].max(axis=0).tolist()]
 
 
+def _to_text(content: dict) -> bytes:
+    """The one text of a `world.json`, so that a change of white space shows as well."""
+    return json.dumps(content, indent=1, sort_keys=True).encode() + b"\n"
+
+
 def _checksum(content: dict) -> str:
-    """SHA-256 of everything else in a `world.json`, independent of white space."""
+    """SHA-256 of everything else in a `world.json`."""
     rest = {key: value for key, value in content.items() if key != "checksum"}
     return hashlib.sha256(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
