@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import typing
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,7 @@ from .snapshot import (
     SnapshotError,
     Texture,
 )
+from .textures import EXTENSIONS
 
 KIND = "snapshot"
 
@@ -51,6 +53,7 @@ LIGHTS_LAYOUT = {
     "reflector": (np.bool_, (None,)),
     "shadow": (np.bool_, (None,)),
 }
+CHANNELS = ("rgb", "r", "g", "b", "a")
 PIXEL_DTYPES = {"srgb": np.uint8, "linear": np.uint8, "float": np.float16}
 
 
@@ -153,14 +156,17 @@ def check(snapshot: Snapshot) -> None:
     _require(len(lights.names) == len(lights.kind), "lights: one name for each lamp")
     _require(bool((lights.kind <= max(LightKind)).all()), "lights: kind is not a known shape")
     _require(bool((lights.strength >= 0).all()), "lights: strength is negative; use a positive power")
-    sky = snapshot.sky
-    _require(sky.ndim == 3 and sky.shape[2] == 3 and sky.size > 0, "sky: shape must be (h, w, 3)")
-    _require(bool(np.isfinite(sky).all() and (sky >= 0).all()), "sky: radiance must be finite and not negative")
-    _require(snapshot.origin.shape == (3,) and bool(np.isfinite(snapshot.origin).all()), "origin: three numbers")
+    _require(bool((lights.size >= 0).all()), "lights: size is negative")
+    _check_sky(snapshot.sky)
+    origin = snapshot.origin
+    _require(origin.shape == (3,) and origin.dtype == np.float64, "origin: three float64 numbers expected")
+    _require(bool(np.isfinite(origin).all()), "origin: three finite numbers expected")
     for image in snapshot.images:
         _check_image(image)
     for material in snapshot.materials:
         _check_material(material, len(snapshot.images))
+    for camera in snapshot.cameras:
+        _check_camera(camera)
 
 
 def _require(condition: bool, message: str) -> None:
@@ -214,19 +220,59 @@ def _check_image(image: Image) -> None:
     _require(pixels.dtype == np.uint8 or bool(np.isfinite(pixels).all()), f"image {image.name!r}: NaN or infinity")
 
 
+def _check_sky(sky: np.ndarray) -> None:
+    fits = sky.ndim == 3 and sky.shape[2] == 3 and sky.size > 0 and sky.dtype == np.float32
+    _require(fits, "sky: shape must be (h, w, 3), float32")
+    _require(bool(np.isfinite(sky).all() and (sky >= 0).all()), "sky: radiance must be finite and not negative")
+
+
 def _check_material(material: Material, image_count: int) -> None:
     where = f"material {material.name!r}"
+    _check_types(where, material)
     _require(material.alpha_mode in ("opaque", "mask", "blend"), f"{where}: unknown alpha mode")
+    _require(np.isfinite(material.ior) and material.ior > 0, f"{where}, ior: must be finite and positive")
+    _require(_is_amount(material.specular_level), f"{where}, specular_level: must be finite and not negative")
+    _require(_is_amount(material.alpha_cutoff), f"{where}, alpha_cutoff: must be finite and not negative")
     for field in dataclasses.fields(Material):
         channel = getattr(material, field.name)
         if not isinstance(channel, Channel):
             continue
         want = 3 if field.name in ("base_color", "emission") else 1
         _require(len(channel.factor) == want, f"{where}, {field.name}: {want} component(s) expected")
-        finite = all(np.isfinite(value) and value >= 0 for value in channel.factor)
-        _require(finite, f"{where}, {field.name}: must be finite and not negative")
+        _require(all(map(_is_amount, channel.factor)), f"{where}, {field.name}: must be finite and not negative")
         if channel.texture is not None:
-            _require(0 <= channel.texture.image < image_count, f"{where}, {field.name}: no such image")
+            _check_texture(f"{where}, {field.name}", channel.texture, image_count)
+
+
+def _check_texture(where: str, texture: Texture, image_count: int) -> None:
+    _require(0 <= texture.image < image_count, f"{where}: no such image")
+    _require(texture.channel in CHANNELS, f"{where}: texture reads an unknown channel {texture.channel!r}")
+    _require(texture.extension in EXTENSIONS, f"{where}: texture has an unknown extension {texture.extension!r}")
+    known = texture.interpolation in ("linear", "closest")
+    _require(known, f"{where}: texture has an unknown interpolation {texture.interpolation!r}")
+    affine = len(texture.uv_from_mesh) == 6 and bool(np.isfinite(texture.uv_from_mesh).all())
+    _require(affine, f"{where}: texture is placed by other than six finite numbers")
+
+
+def _check_camera(camera: Camera) -> None:
+    where = f"camera {camera.name!r}"
+    _check_types(where, camera)
+    numbers = (*camera.world_from_camera, camera.half_width, *camera.shift)
+    _require(len(camera.world_from_camera) == 12, f"{where}: its matrix needs 12 numbers")
+    _require(bool(np.isfinite(numbers).all()) and camera.half_width > 0, f"{where}: must be finite, with some width")
+    _require(min(camera.resolution) > 0, f"{where}: its resolution has no pixels")
+
+
+def _check_types(where: str, record) -> None:
+    try:
+        _plain(record)
+    except ValueError as error:
+        raise SnapshotError(f"snapshot, {where}: {error}") from error
+
+
+def _is_amount(value: float) -> bool:
+    """Whether a number is finite and not negative."""
+    return bool(np.isfinite(value)) and value >= 0
 
 
 def _to_container(snapshot: Snapshot) -> tuple[dict[str, np.ndarray], dict]:
@@ -238,9 +284,9 @@ def _to_container(snapshot: Snapshot) -> tuple[dict[str, np.ndarray], dict]:
         "instance_names": list(snapshot.geometry.instance_names),
         "light_names": list(snapshot.lights.names),
         "images": [{"name": image.name, "encoding": image.encoding} for image in snapshot.images],
-        "materials": [dataclasses.asdict(material) for material in snapshot.materials],
-        "cameras": [dataclasses.asdict(camera) for camera in snapshot.cameras],
-        "notes": [dataclasses.asdict(note) for note in snapshot.notes],
+        "materials": [_plain(material) for material in snapshot.materials],
+        "cameras": [_plain(camera) for camera in snapshot.cameras],
+        "notes": [_plain(note) for note in snapshot.notes],
         "source": snapshot.source,
     }
     return arrays, meta
@@ -249,32 +295,41 @@ def _to_container(snapshot: Snapshot) -> tuple[dict[str, np.ndarray], dict]:
 def _from_container(arrays: dict[str, np.ndarray], meta: dict) -> Snapshot:
     geometry = {name: arrays[f"geometry/{name}"] for name in GEOMETRY_LAYOUT}
     lights = {name: arrays[f"lights/{name}"] for name in LIGHTS_LAYOUT}
-    images = [Image(entry["name"], arrays[f"image/{i}"], entry["encoding"]) for i, entry in enumerate(meta["images"])]
+    labels = [(_build(str, entry["name"]), _build(str, entry["encoding"])) for entry in meta["images"]]
     return Snapshot(
         origin=arrays["origin"],
-        geometry=Geometry(**geometry, instance_names=tuple(meta["instance_names"])),
-        materials=tuple(_material(entry) for entry in meta["materials"]),
-        images=tuple(images),
-        lights=Lights(**lights, names=tuple(meta["light_names"])),
+        geometry=Geometry(**geometry, instance_names=_build(tuple[str, ...], meta["instance_names"])),
+        materials=_build(tuple[Material, ...], meta["materials"]),
+        images=tuple(Image(name, arrays[f"image/{i}"], encoding) for i, (name, encoding) in enumerate(labels)),
+        lights=Lights(**lights, names=_build(tuple[str, ...], meta["light_names"])),
         sky=arrays["sky"],
-        cameras=tuple(_camera(entry) for entry in meta["cameras"]),
-        notes=tuple(Note(**entry) for entry in meta["notes"]),
-        source=meta["source"],
+        cameras=_build(tuple[Camera, ...], meta["cameras"]),
+        notes=_build(tuple[Note, ...], meta["notes"]),
+        source=_build(str, meta["source"]),
     )
 
 
-def _material(entry: dict) -> Material:
-    channels = {name: _channel(value) for name, value in entry.items() if isinstance(value, dict)}
-    return Material(**{**entry, **channels})
+def _build(kind, value):
+    """A value from outside as what a record's field is declared to be; anything else is a ValueError."""
+    if dataclasses.is_dataclass(kind):
+        kinds = typing.get_type_hints(kind)
+        if not isinstance(value, dict) or set(value) != set(kinds):
+            raise ValueError(f"{kind.__name__} has the fields {', '.join(kinds)}")
+        return kind(**{name: _build(kinds[name], value[name]) for name in kinds})
+    parts = typing.get_args(kind)
+    if typing.get_origin(kind) is tuple:
+        if not isinstance(value, (list, tuple)):
+            raise ValueError(f"{value!r} is not a list")
+        items = parts[:1] * len(value) if parts[-1] is Ellipsis else parts
+        return tuple(_build(item, part) for item, part in zip(items, value, strict=True))
+    if type(None) in parts:
+        return None if value is None else _build(parts[0], value)
+    fits = isinstance(value, (int, float) if kind is float else kind)
+    if not fits or (isinstance(value, bool) and kind is not bool):
+        raise ValueError(f"{value!r} is not {kind.__name__}")
+    return kind(value)
 
 
-def _channel(entry: dict) -> Channel:
-    texture = entry["texture"]
-    if texture is not None:
-        texture = Texture(**{**texture, "uv_from_mesh": tuple(float(v) for v in texture["uv_from_mesh"])})
-    return Channel(tuple(float(value) for value in entry["factor"]), texture, bool(entry["vertex_color"]))
-
-
-def _camera(entry: dict) -> Camera:
-    lists = {name: tuple(value) for name, value in entry.items() if isinstance(value, list)}
-    return Camera(**{**entry, **lists})
+def _plain(record) -> dict:
+    """A record as JSON; whole numbers become floats where those are declared, so that equal scenes stay equal."""
+    return dataclasses.asdict(_build(type(record), dataclasses.asdict(record)))
