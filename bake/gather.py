@@ -110,6 +110,8 @@ def gather(
         np.zeros((count if suns else 0, suns, *shape), np.float32),
         np.zeros((count if functions else 0, functions, *shape), np.float32),
     )
+    if not (scene.has_local or suns or functions):
+        return out
     keys = _seeded(keys, effort.seed)
 
     def work(rows: np.ndarray) -> int:
