@@ -1,0 +1,143 @@
+"""A Blender scene as a snapshot: the one door between Blender's data and the bake.
+
+Comes in: a context, a dependency graph or a file. Goes out: a `Snapshot` of what *renders*: objects, modifiers
+and visibility with their render settings, whatever the viewport shows. The scene is not changed.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+
+from ..bake.snapshot import Snapshot, SnapshotError
+from . import cameras, render_depsgraph, scene_file, sky
+from .evaluate import Evaluator
+from .geometry import Meshes, origin
+from .images import Images
+from .lights import Lamps
+from .materials import Materials
+from .node_values import VALUES
+from .notes import Notes
+from .placement import Placements
+
+# What renders but has no surface made of triangles.
+WITHOUT_MESH = {
+    "CURVES": "hair curves",
+    "POINTCLOUD": "point cloud",
+    "VOLUME": "volume",
+    "GREASEPENCIL": "grease pencil",
+    "GPENCIL": "grease pencil",
+}
+
+
+def extract(context_or_depsgraph: bpy.types.Context | bpy.types.Depsgraph) -> Snapshot:
+    """Return a snapshot of a scene.
+
+    Parameters
+    ----------
+    context_or_depsgraph : bpy.types.Context or bpy.types.Depsgraph
+        Names the scene and the view layer. The viewport's graph stands for the same scene as it renders; a
+        render engine's graph is read as it is.
+
+    Returns
+    -------
+    Snapshot
+        The scene.
+
+    Raises
+    ------
+    SnapshotError
+        There is nothing to bake, or it holds invalid numbers; the message names the object and the remedy.
+    """
+    if isinstance(context_or_depsgraph, bpy.types.Depsgraph):
+        depsgraph = context_or_depsgraph
+        if depsgraph.mode == "RENDER":
+            return _read(depsgraph, depsgraph.scene.original, cameras.picture_size(depsgraph.scene))
+        scene, view_layer = depsgraph.scene.original, depsgraph.view_layer.original
+    else:
+        scene, view_layer = context_or_depsgraph.scene, context_or_depsgraph.view_layer
+    size = cameras.picture_size(scene)
+    with scene_file.quiet():
+        return render_depsgraph.read(scene, view_layer, lambda depsgraph: _read(depsgraph, scene, size))
+
+
+def from_file(path: Path | str) -> Snapshot:
+    """Return a snapshot of a scene file, which replaces what is open in this Blender.
+
+    Parameters
+    ----------
+    path : Path or str
+        A .blend, .glb or .gltf file.
+
+    Returns
+    -------
+    Snapshot
+        The scene.
+
+    Raises
+    ------
+    SnapshotError
+        The file cannot be read, or there is nothing to bake; the message is one line.
+    """
+    with scene_file.quiet():
+        scene_file.open_scene(Path(path))
+        return extract(bpy.context)
+
+
+def _read(depsgraph: bpy.types.Depsgraph, scene: bpy.types.Scene, size: tuple[int, int]) -> Snapshot:
+    """Read an evaluated scene."""
+    notes = Notes()
+    images = Images(notes)
+    evaluator = Evaluator(images, notes, VALUES)
+    meshes, lamps = Meshes(notes, Materials(evaluator)), Lamps(notes, evaluator)
+    _gather(depsgraph, meshes, lamps, notes)
+    if not meshes.instances:
+        raise SnapshotError(_nothing(scene, lamps))
+    return Snapshot(
+        origin=origin(*meshes.bounds()),
+        geometry=meshes.record(),
+        materials=tuple(meshes.materials.records),
+        images=tuple(images.records),
+        lights=lamps.record(),
+        sky=sky.read(depsgraph.scene.world, evaluator),
+        cameras=cameras.read(depsgraph, scene.camera, size, notes),
+        notes=notes.record(),
+        source=bpy.data.filepath,
+    )
+
+
+def _gather(depsgraph: bpy.types.Depsgraph, meshes: Meshes, lamps: Lamps, notes: Notes) -> None:
+    """Walk everything that renders."""
+    placements = Placements()
+    for instance in depsgraph.object_instances:
+        object = instance.object
+        name = object.name
+        if not instance.show_self:
+            continue
+        if isinstance(object.data, bpy.types.Mesh):
+            if _lights_others(object, notes):
+                meshes.add(object, placements.matrix(instance), name)
+        elif object.type == "LIGHT":
+            lamps.add(object, placements.matrix(instance), name)
+        elif object.type in WITHOUT_MESH:
+            notes.add(WITHOUT_MESH[object.type], "left out", f"'{name}'")
+
+
+def _lights_others(object: bpy.types.Object, notes: Notes) -> bool:
+    """Whether bounced light can meet an object, by its ray visibility; partly visible ones count as visible."""
+    seen = object.visible_diffuse, object.visible_shadow
+    if not any(seen):
+        notes.add("object hidden from diffuse and shadow rays", "left out", f"'{object.name}'")
+    elif not all(seen):
+        notes.add("object partly hidden from rays", "visible to all", f"'{object.name}'")
+    return any(seen)
+
+
+def _nothing(scene: bpy.types.Scene, lamps: Lamps) -> str:
+    """What to do about a scene without surfaces."""
+    found = f"{len(lamps.rows)} lamps but no" if lamps.rows else "no"
+    return (
+        f"scene '{scene.name}' has {found} mesh that renders: add one, or enable its render visibility "
+        "(camera icon in the outliner)"
+    )

@@ -1,0 +1,121 @@
+"""The dependency graph that renders, for a moment.
+
+Blender hands out a graph with *render* settings (modifiers' render levels, render visibility, objects that are
+hidden in the viewport alone) to render engines only. So a temporary engine renders a temporary copy of the
+scene: it gets the graph, reads it, and draws nothing. The copy shares all objects; everything temporary is
+removed also when reading fails, and the user's scene, selection, mode and undo stack are never touched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import bpy
+
+from ..bake.snapshot import SnapshotError
+
+ENGINE = "GI_VOLUMES_READER"
+RENDER_RESULT = "Render Result"
+# The picture is thrown away; Blender allows no smaller one.
+PICTURE_PX = 4
+
+
+def read(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, reader: Callable[[Any], Any]) -> Any:
+    """Call a function with the graph of a scene as it renders.
+
+    Parameters
+    ----------
+    scene : bpy.types.Scene
+        The scene, not evaluated.
+    view_layer : bpy.types.ViewLayer
+        Which of its view layers.
+    reader : callable
+        `reader(depsgraph)`; nothing of the graph may be kept after it returns.
+
+    Returns
+    -------
+    Any
+        What the reader returned.
+
+    Raises
+    ------
+    SnapshotError
+        Blender did not evaluate the scene, for example because a render is running.
+    """
+    outcome: dict[str, Any] = {}
+
+    class Reader(bpy.types.RenderEngine):
+        bl_idname = ENGINE
+        bl_label = "GI Volumes Reader"
+
+        def render(self, depsgraph: bpy.types.Depsgraph) -> None:
+            try:
+                outcome["value"] = reader(depsgraph)
+            except Exception as error:  # Blender would print and forget it
+                outcome["error"] = error
+
+    bpy.utils.register_class(Reader)
+    try:
+        with _copy(scene, view_layer) as copy:
+            _render(copy)
+    finally:
+        bpy.utils.unregister_class(Reader)
+    if "error" in outcome:
+        raise outcome["error"]
+    if "value" not in outcome:
+        raise SnapshotError(
+            f"scene '{scene.name}' could not be evaluated: wait until the running render ends, try again"
+        )
+    return outcome["value"]
+
+
+@contextmanager
+def temporary_result() -> Iterator[None]:
+    """Remove the image of render results afterwards, unless there was one before."""
+    before = RENDER_RESULT in bpy.data.images
+    try:
+        yield
+    finally:
+        image = bpy.data.images.get(RENDER_RESULT)
+        if image is not None and not before:
+            bpy.data.images.remove(image)
+
+
+@contextmanager
+def _copy(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer) -> Iterator[bpy.types.Scene]:
+    """A scene with the same objects and one view layer, which renders with the reader and into nothing."""
+    name = view_layer.name
+    camera = bpy.data.cameras.new("GI Volumes")
+    copy = scene.copy()
+    try:
+        _keep_only(copy, name)
+        if copy.camera is None:
+            copy.camera = bpy.data.objects.new("GI Volumes", camera)
+        render = copy.render
+        render.engine = ENGINE
+        render.resolution_x = render.resolution_y = PICTURE_PX
+        render.resolution_percentage = 100
+        render.use_compositing = render.use_sequencer = render.use_multiview = False
+        render.use_border = False
+        yield copy
+    finally:
+        bpy.data.scenes.remove(copy)
+        bpy.data.cameras.remove(camera)
+
+
+def _keep_only(scene: bpy.types.Scene, name: str) -> None:
+    """Drop the other view layers: each would render."""
+    for layer in [layer for layer in scene.view_layers if layer.name != name]:
+        scene.view_layers.remove(layer)
+    scene.view_layers[name].use = True
+
+
+def _render(scene: bpy.types.Scene) -> None:
+    """Render on this thread, without handlers' or the user's scene's knowledge."""
+    with temporary_result():
+        try:
+            bpy.ops.render.render(scene=scene.name)
+        except RuntimeError as error:
+            raise SnapshotError(f"scene '{scene.name}' could not be evaluated: {str(error).strip()}") from error
