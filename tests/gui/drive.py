@@ -60,8 +60,10 @@ def until(condition, running=None):
             seen["progress"].append(running.progress.stage)
         if condition():
             return
+        if running is not None and job().current is not running:
+            break
         yield
-    raise TimeoutError(f"waited in vain; the last bake: {job().last}")
+    raise AssertionError(f"waited in vain; the last bake: {job().last}")
 
 
 def scenario():
