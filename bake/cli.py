@@ -9,21 +9,26 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import os
+import re
+import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-
 from ..tree import container, verify, world
-from ..tree.atomic import write_bytes_atomically
 from . import job, reference, snapshot_file
+from .arrays import check_output, one_line, read_points, write_array
+from .place import SNAPSHOT_NAME, check_target, scene_defects
 from .progress import Progress
-from .settings import QUALITIES, Settings, SettingsError, numbers
+from .settings import QUALITIES, Settings, SettingsError, numbers, of_reference, unit
 from .snapshot import Snapshot, SnapshotError
 
 EXPECTED = (SnapshotError, SettingsError, container.FileError, OSError, ValueError, MemoryError)
 """Errors that are the input's fault: one line, no traceback."""
+
+MAY_BE_NEGATIVE = ("--sun", "--sky", "--cells", "--finest")
+"""Options whose value may begin with a minus, which would otherwise pass for an option."""
 
 Extract = Callable[[Path, Path], None]
 
@@ -48,45 +53,65 @@ def main(argv: list[str], extract: Extract) -> int:
     KeyboardInterrupt
         The user stopped it.
     """
-    options = _parser().parse_args(argv)
+    options = _parser().parse_args(_joined(argv))
+    try:
+        return _run(options, extract)
+    except BrokenPipeError:
+        _close_outputs()
+        return 1
+
+
+def _run(options, extract: Extract) -> int:
+    """Run a command and say how it ended."""
     progress = Progress(getattr(options, "progress", "text") == "json")
     try:
         result = options.run(options, extract, progress)
+        progress.finish(result)
+        _print_result(options, result)
+    except BrokenPipeError:
+        raise
     except EXPECTED as error:
         progress.fail(one_line(error))
         return 1
-    progress.finish(result)
-    if options.json:
-        print(json.dumps(result))
-    elif options.show is not None and getattr(options, "progress", "text") != "json":
-        print(options.show(result))
+    except KeyboardInterrupt:
+        progress.interrupt()
+        raise
     return 1 if result.get("defects") else 0
 
 
-def one_line(error: BaseException) -> str:
-    """Say an error in one line.
+def _print_result(options, result: dict) -> None:
+    """The result as an object or for people; with `--progress json` it was the last line already."""
+    if getattr(options, "progress", "text") == "json":
+        return
+    text = json.dumps(result) if options.json else options.show(result) if options.show else ""
+    if text:
+        encoding = sys.stdout.encoding or "utf-8"
+        print(text.encode(encoding, "backslashreplace").decode(encoding), flush=True)
 
-    Parameters
-    ----------
-    error : BaseException
-        What was raised.
 
-    Returns
-    -------
-    str
-        Its message without line breaks.
-    """
-    if isinstance(error, OSError) and error.strerror:
-        where = f"{error.filename}: " if error.filename else ""
-        return f"{where}{error.strerror}"
-    if isinstance(error, MemoryError):
-        return "out of memory; use fewer samples or threads, or coarser voxels (--finest)"
-    return " ".join(str(error).split()) or type(error).__name__
+def _close_outputs() -> None:
+    """Nobody reads any more: let Python end without complaining about it."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in (sys.stdout, sys.stderr):
+        os.dup2(nowhere, stream.fileno())
+
+
+def _joined(argv: list[str]) -> list[str]:
+    """The arguments, with values that begin with a minus tied to their options: --sun=-1,0,2."""
+    joined: list[str] = []
+    for word in argv:
+        if joined and joined[-1] in MAY_BE_NEGATIVE and re.match(r"-[\d.]", word):
+            joined[-1] += f"={word}"
+        else:
+            joined.append(word)
+    return joined
 
 
 def _parser() -> argparse.ArgumentParser:
-    """Every command with its options."""
-    parser = argparse.ArgumentParser(prog="gi_volumes", description="Bakes global-illumination volumes.")
+    """Every command with its options; an option's name has to be whole, so that new ones can be added."""
+    parser = argparse.ArgumentParser(
+        prog="gi_volumes", description="Bakes global-illumination volumes.", allow_abbrev=False
+    )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _add_bake(commands)
     _add_folder_command(commands, "info", "what is in a bake", _run_info, _show_info)
@@ -101,15 +126,17 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_command(commands, name: str, text: str, run, show) -> argparse.ArgumentParser:
     """A command with what all commands share."""
-    command = commands.add_parser(name, help=text, description=text)
-    command.add_argument("--json", action="store_true", help="print one JSON object on standard output")
+    command = commands.add_parser(name, help=text, description=text, allow_abbrev=False)
+    command.add_argument(
+        "--json", action="store_true", help="print one JSON object on standard output, and nothing else"
+    )
     command.set_defaults(run=run, show=show)
     return command
 
 
 def _add_folder_command(commands, name: str, text: str, run, show) -> None:
     """A command that only looks at a bake."""
-    _add_command(commands, name, text, run, show).add_argument("folder", type=Path, metavar="DIR")
+    _add_command(commands, name, text, run, show).add_argument("folder", type=_path, metavar="DIR")
 
 
 def _add_light(command: argparse.ArgumentParser) -> None:
@@ -128,8 +155,8 @@ def _add_light(command: argparse.ArgumentParser) -> None:
 
 def _add_bake(commands) -> None:
     command = _add_command(commands, "bake", "bake a scene into a folder", _run_bake, _show_bake)
-    command.add_argument("scene", type=Path, metavar="SCENE", help=".blend, .glb, .gltf, or a snapshot (.giv)")
-    command.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
+    command.add_argument("scene", type=_path, metavar="SCENE", help=".blend, .glb, .gltf, or a snapshot (.giv)")
+    command.add_argument("-o", "--output", type=_path, required=True, metavar="DIR")
     command.add_argument("--quality", choices=tuple(QUALITIES), default="preview")
     command.add_argument("--samples", type=_positive, help="paths per data point, instead of the quality's")
     command.add_argument("--finest", type=float, default=0.0, help="size of the finest voxels in metres")
@@ -139,14 +166,14 @@ def _add_bake(commands) -> None:
 
 def _add_query(commands) -> None:
     command = _add_command(commands, "query", "irradiance from a bake", _run_query, None)
-    command.add_argument("folder", type=Path, metavar="DIR")
+    command.add_argument("folder", type=_path, metavar="DIR")
     _add_points(command)
     command.add_argument("--sun", help="x,y,z towards the sun, instead of the scene's")
 
 
 def _add_reference(commands) -> None:
     command = _add_command(commands, "reference", "path-traced irradiance at points", _run_reference, None)
-    command.add_argument("scene", type=Path, metavar="SCENE")
+    command.add_argument("scene", type=_path, metavar="SCENE")
     _add_points(command)
     command.add_argument("--samples", type=_positive, default=1024, help="paths per point")
     _add_light(command)
@@ -155,8 +182,8 @@ def _add_reference(commands) -> None:
 def _add_compare(commands) -> None:
     text = "a picture of the baked irradiance beside the path-traced one and their difference"
     command = _add_command(commands, "compare", text, _run_compare, _show_compare)
-    command.add_argument("folder", type=Path, metavar="DIR")
-    command.add_argument("-o", "--output", type=Path, required=True, metavar="IMAGE", help=".png or .exr")
+    command.add_argument("folder", type=_path, metavar="DIR")
+    command.add_argument("-o", "--output", type=_path, required=True, metavar="IMAGE", help=".png or .exr")
     command.add_argument("--camera", help="its name; the scene's active camera without it")
     command.add_argument("--size", type=_size, default=(480, 270), metavar="WxH", help="of each of the three pictures")
     command.add_argument("--samples", type=_positive, default=256, help="paths per pixel of the reference")
@@ -167,15 +194,16 @@ def _add_compare(commands) -> None:
 
 def _add_points(command: argparse.ArgumentParser) -> None:
     """Where to measure, and where to write it."""
-    command.add_argument("--points", type=Path, required=True, metavar="P.npy", help="(n, 3) points in metres")
-    command.add_argument("--normals", type=Path, required=True, metavar="N.npy", help="(n, 3) unit normals")
-    command.add_argument("-o", "--output", type=Path, required=True, metavar="E.npy")
+    command.add_argument("--points", type=_path, required=True, metavar="P.npy", help="(n, 3) points in metres")
+    command.add_argument("--normals", type=_path, required=True, metavar="N.npy", help="(n, 3) unit normals")
+    command.add_argument("-o", "--output", type=_path, required=True, metavar="E.npy")
     command.add_argument("--transport", choices=("local", "sun", "sky", "all"), default="all")
 
 
 def _run_bake(options, extract: Extract, progress: Progress) -> dict:
     samples, bounces = QUALITIES[options.quality]
     settings = _settings(options, options.samples or samples, bounces, options.finest)
+    check_target(options.output)
     snapshot = _read_scene(options.scene, extract, progress)
     outcome = job.bake(snapshot, options.output, settings, options.cells, options.threads, progress)
     return dataclasses.asdict(outcome)
@@ -197,7 +225,7 @@ def _read_scene(path: Path, extract: Extract, progress: Progress) -> Snapshot:
         raise SnapshotError(f"{path}: unknown kind of scene; use .blend, .glb, .gltf or a snapshot (.giv)")
     progress.stage("Reading the scene")
     with tempfile.TemporaryDirectory(prefix="gi_volumes_") as scratch:
-        snapshot = Path(scratch) / job.SNAPSHOT_NAME
+        snapshot = Path(scratch) / SNAPSHOT_NAME
         extract(path, snapshot)
         return snapshot_file.load(snapshot)
 
@@ -207,25 +235,27 @@ def _run_info(options, extract: Extract, progress: Progress) -> dict:
 
 
 def _run_verify(options, extract: Extract, progress: Progress) -> dict:
-    defects = verify.verify(options.folder)
+    defects = verify.verify(options.folder) + scene_defects(options.folder)
     return {"defects": [dataclasses.asdict(defect) for defect in defects]}
 
 
 def _run_query(options, extract: Extract, progress: Progress) -> dict:
-    loaded = world.load(options.folder)
-    points, normals = _read_points(options)
-    sun = None
+    check_output(options.output)
+    points, normals = read_points(options.points, options.normals)
+    direction = None
     if options.sun is not None:
-        direction = numbers(options.sun, "--sun", (3,))
-        sun = (direction / np.linalg.norm(direction), loaded.sun_irradiance)
+        direction = unit(numbers(options.sun, "--sun", (3,))[None], f"--sun {options.sun}")[0]
+    loaded = world.load(options.folder)
+    sun = None if direction is None else (direction, loaded.sun_irradiance)
     values = loaded.irradiance(points, normals, sun=sun, transport=options.transport)
-    _write_array(options.output, values)
+    write_array(options.output, values)
     return {"points": len(points), "output": str(options.output)}
 
 
 def _run_reference(options, extract: Extract, progress: Progress) -> dict:
-    points, normals = _read_points(options)
-    settings = _settings(options, options.samples, QUALITIES["final"][1])
+    check_output(options.output)
+    points, normals = read_points(options.points, options.normals)
+    settings = of_reference(_settings(options, options.samples, QUALITIES["final"][1]))
     snapshot = _read_scene(options.scene, extract, progress)
     values = reference.irradiance(
         snapshot,
@@ -238,53 +268,16 @@ def _run_reference(options, extract: Extract, progress: Progress) -> dict:
         settings,
         options.threads,
     )
-    _write_array(options.output, values)
+    write_array(options.output, values)
     return {"points": len(points), "output": str(options.output)}
 
 
 def _run_compare(options, extract: Extract, progress: Progress) -> dict:
     from . import compare
 
+    check_output(options.output)
     view = compare.View(options.camera, options.size, options.samples, options.transport, options.threads)
     return compare.compare(options.folder, options.output, view, progress)
-
-
-def _read_points(options) -> tuple[np.ndarray, np.ndarray]:
-    """Points and unit normals of equal number."""
-    points, normals = _read_array(options.points), _read_array(options.normals)
-    if len(points) != len(normals):
-        raise SettingsError(
-            f"{options.points} has {len(points)} rows and {options.normals} {len(normals)}: want the same"
-        )
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    if (length == 0).any():
-        raise SettingsError(
-            f"{options.normals}: row {int(np.argmin(length))} has no length; normals must be directions"
-        )
-    return points, normals / length
-
-
-def _read_array(path: Path) -> np.ndarray:
-    """(n, 3) finite float64 numbers of a .npy file; nothing in it is executed."""
-    try:
-        array = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError) as error:
-        raise SettingsError(f"{path}: not a .npy file of numbers ({one_line(error)})") from error
-    if not isinstance(array, np.ndarray) or array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "fiu":
-        raise SettingsError(f"{path}: want numbers of shape (n, 3)")
-    array = array.astype(np.float64)
-    if not np.isfinite(array).all():
-        raise SettingsError(f"{path}: row {int(np.argmax(~np.isfinite(array).all(axis=1)))} holds NaN or infinity")
-    return array
-
-
-def _write_array(path: Path, array: np.ndarray) -> None:
-    """A .npy file, whole or not at all."""
-    import io
-
-    buffer = io.BytesIO()
-    np.save(buffer, array.astype(np.float32), allow_pickle=False)
-    write_bytes_atomically(path, buffer.getvalue())
 
 
 def _show_bake(result: dict) -> str:
@@ -314,17 +307,28 @@ def _show_compare(result: dict) -> str:
 
 
 def _natural(text: str) -> int:
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text} is negative")
-    return value
+    return _whole(text, 0)
 
 
 def _positive(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not at least 1")
+    return _whole(text, 1)
+
+
+def _whole(text: str, least: int) -> int:
+    """A whole number of at least so much."""
+    try:
+        value = int(text)
+    except ValueError:
+        value = least - 1
+    if value < least:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least {least}")
     return value
+
+
+def _path(text: str) -> Path:
+    if not text:
+        raise argparse.ArgumentTypeError("an empty path")
+    return Path(text)
 
 
 def _cells(text: str) -> list[tuple[int, int]]:

@@ -14,13 +14,13 @@ import numpy as np
 from ..tree import world
 from . import reference, snapshot_file, warp
 from .gather import Effort
-from .job import SNAPSHOT_NAME
 from .lamps import LUMINANCE
-from .picture import write_pictures
+from .picture import check_path, write_pictures
+from .place import SNAPSHOT_NAME, scene_defects
 from .progress import Progress
 from .rays import MISS
 from .scene import Scene, prepare
-from .settings import Settings, SettingsError, model
+from .settings import Settings, SettingsError, model, of_reference
 from .snapshot import Camera, Snapshot
 
 LAYERS = 16
@@ -60,12 +60,15 @@ def compare(folder: Path, image: Path, view: View, progress: Progress) -> dict:
     Raises
     ------
     SettingsError
-        There is no such camera, or no kind of picture by that name.
+        There is no such camera, no kind of picture by that name, or another scene in the folder.
     """
+    check_path(image)
     baked = world.load(folder)
+    for defect in scene_defects(folder):
+        raise SettingsError(f"{folder / defect.file}: {defect.what}")
     snapshot = snapshot_file.load(folder / SNAPSHOT_NAME)
     camera = _camera(snapshot, view.camera)
-    settings = Settings(**baked.header["settings"])
+    settings = of_reference(Settings(**baked.header["settings"]))
     snapshot, light = model(snapshot, settings)
     progress.stage("Preparing")
     scene = prepare(snapshot, light)
@@ -157,15 +160,18 @@ def _camera(snapshot: Snapshot, name: str | None) -> Camera:
     for camera in snapshot.cameras:
         if name is None or camera.name == name:
             return camera
+    if name is None:
+        raise SettingsError("the scene has no camera to look through; add one and bake again")
     known = ", ".join(repr(camera.name) for camera in snapshot.cameras) or "none"
-    raise SettingsError(f"--camera {name or ''}: the scene has no such camera; cameras: {known}")
+    raise SettingsError(f"--camera {name}: the scene has no such camera; cameras: {known}")
 
 
 def _traced(scene: Scene, snapshot: Snapshot, points, normals, view: View, settings: Settings, progress: Progress):
     """(n, 3) path-traced irradiance of the transport that is looked at."""
     effort = Effort(view.samples, settings.bounces, settings.seed + 1, view.threads)
     found = reference.at(scene, points, normals, effort, progress.show)
-    return reference.total(snapshot, scene, found, view.transport)
+    values = reference.total(snapshot, scene, found, view.transport)
+    return values if len(values) else np.zeros((len(points), 3), np.float32)
 
 
 def _fill(size: tuple[int, int], pixels: np.ndarray, values: np.ndarray) -> np.ndarray:

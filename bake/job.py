@@ -20,18 +20,16 @@ from ..tree.grid import Grid
 from ..tree.topology import Topology
 from . import datapoints, snapshot_file
 from .gather import CancelledError, Effort, Gathered, gather
+from .place import Place, check_target
 from .progress import Progress
+from .reference import sun_strength
 from .scene import Model, Scene, prepare, scene_suns
 from .sensors import DataPoints
-from .settings import Settings, SettingsError, check_scene, choose_grid, model
-from .snapshot import LightKind, Snapshot
-
-SNAPSHOT_NAME = "scene.giv"
-"""The snapshot inside a bake's folder."""
+from .settings import Settings, SettingsError, check_scene, check_triangles, choose_grid, has_free_sun, model
+from .snapshot import Snapshot
 
 FORMAT = "gi_volumes bake 1"
 """Part of every bake's hash: files of another definition are baked anew."""
-
 
 LISTED = 12
 """Cells that a message names."""
@@ -93,24 +91,28 @@ def bake(
     """
     progress = progress or Progress()
     check_scene(snapshot)
+    check_target(target)
     progress.stage("Preparing")
-    snapshot, light = model(snapshot, settings)
-    identity = bake_hash(snapshot, settings, light)
-    scene = prepare(snapshot, light)
+    effective, light = model(snapshot, settings)
+    identity = bake_hash(effective, settings, light)
+    scene = prepare(effective, light)
+    check_triangles(scene.soup.corners)
     grid = choose_grid(scene.soup.corners, snapshot.origin, settings.finest)
     occupied = [tuple(int(v) for v in cell) for cell in build.occupied_cells(scene.soup.corners, grid)]
     header = _header(snapshot, settings, light, scene, grid, identity) | {"expected_cells": occupied}
-    target.mkdir(parents=True, exist_ok=True)
-    snapshot_file.save(snapshot, target / SNAPSHOT_NAME)
     trees = _build_trees(scene, grid, _wanted(cells, occupied), progress)
     outcome = _describe(snapshot, light, scene, trees)
+    place = Place(target, snapshot, header)
     try:
-        _bake_cells(scene, grid, trees, target, settings, threads, identity, progress)
+        _bake_cells(scene, grid, trees, place, settings, threads, progress)
+        place.take()
     finally:
-        folder.assemble(target, header)
+        listed = folder.assemble(target, header)["cells"] if place.taken else []
+    if len(listed) < len(occupied):
+        outcome.warnings.append(f"{len(occupied) - len(listed)} of the scene's {len(occupied)} cells are not baked yet")
     outcome.seconds = progress.seconds
     outcome.rays = scene.tracer.rays
-    outcome.bytes = _file_sizes(target)
+    outcome.bytes = _file_sizes(listed)
     return outcome
 
 
@@ -154,19 +156,19 @@ def _build_trees(scene: Scene, grid: Grid, cells: list[tuple[int, int]], progres
     return trees
 
 
-def _bake_cells(scene, grid, trees: list[Topology], target, settings, threads, identity, progress: Progress) -> None:
+def _bake_cells(scene, grid, trees: list[Topology], place: Place, settings, threads, progress: Progress) -> None:
     """Cell after cell; the ones already there are only counted."""
+    missing = [tree for tree in trees if not folder.has_cell(place.target, tree.cell, place.identity)]
     total = sum(tree.size for tree in trees)
-    done = 0
-    progress.stage("Baking", total)
-    for tree in trees:
-        if not folder.has_cell(target, tree.cell, identity):
-            _bake_cell(scene, grid, tree, target, settings, threads, identity, lambda n, d=done: progress.show(d + n))
+    done = total - sum(tree.size for tree in missing)
+    progress.stage("Baking", total, done)
+    for tree in missing:
+        _bake_cell(scene, grid, tree, place, settings, threads, lambda n, d=done: progress.show(d + n))
         done += tree.size
         progress.show(done)
 
 
-def _bake_cell(scene, grid: Grid, tree: Topology, target, settings: Settings, threads, identity, show) -> None:
+def _bake_cell(scene, grid: Grid, tree: Topology, place: Place, settings: Settings, threads, show) -> None:
     """Place the data points of one cell, gather their light, write its files."""
     level, coords = tree.voxels()
     size = np.asarray(grid.voxel_size(level.astype(np.int64)), np.float64)
@@ -178,7 +180,7 @@ def _bake_cell(scene, grid: Grid, tree: Topology, target, settings: Settings, th
     position = np.ascontiguousarray(placed.position[:, order])
     found = gather(scene, DataPoints(), position, key[order], effort, show)
     payloads = {name: _spread(values, order, tree.size) for name, values in _payloads(found)}
-    folder.write_cell(target, tree, payloads, placed.valid, placed.offset, {"bake": identity})
+    place.write_cell(tree, payloads, placed.valid, placed.offset)
 
 
 def _payloads(found: Gathered):
@@ -204,7 +206,7 @@ def _header(snapshot: Snapshot, settings: Settings, light: Model, scene: Scene, 
     if scene.has_local:
         transports["local"] = {"unit": "W/m2"}
     if len(light.suns.toward):
-        transports["sun"] = _sun_header(snapshot, light)
+        transports["sun"] = _sun_header(snapshot, settings, light)
     if light.sky != "none":
         transports["sky"] = {"kind": light.sky, "unit": "W/m2"}
     if light.sky == "harmonics":
@@ -219,18 +221,17 @@ def _header(snapshot: Snapshot, settings: Settings, light: Model, scene: Scene, 
     }
 
 
-def _sun_header(snapshot: Snapshot, light: Model) -> dict:
-    """Key directions, and the suns that shine when nobody says otherwise."""
-    own = scene_suns(snapshot)
-    lights = snapshot.lights
-    rows = (lights.kind == LightKind.SUN) & (lights.strength > 0).any(axis=1)
+def _sun_header(snapshot: Snapshot, settings: Settings, light: Model) -> dict:
+    """Key directions, and the suns that shine when nobody says otherwise: the scene's, or the one asked for."""
+    shining = (scene_suns(snapshot) if has_free_sun(settings.sun) else light.suns).toward
+    strength = sun_strength(snapshot, len(shining))
     return {
         "unit": "1, irradiance per W/m2 of sun on a surface facing it",
         "directions": light.suns.toward.tolist(),
         "diameters": light.suns.diameter.tolist(),
         "scene": [
-            {"direction": direction.tolist(), "irradiance": strength.tolist()}
-            for direction, strength in zip(own.toward, lights.strength[rows], strict=True)
+            {"direction": direction.tolist(), "irradiance": irradiance.tolist()}
+            for direction, irradiance in zip(shining, strength, strict=True)
         ],
     }
 
@@ -240,7 +241,7 @@ def _describe(snapshot: Snapshot, light: Model, scene: Scene, trees: list[Topolo
     outcome = Outcome(len(scene.soup.corners), len(trees), sum(tree.size for tree in trees))
     parts = {
         "local": (scene.has_local, "the scene has no lamps and no emissive surfaces"),
-        "sun": (len(light.suns.toward) > 0, "there is no sun"),
+        "sun": (len(light.suns.toward) > 0, "there is no sun, or none was asked for"),
         "sky": (light.sky != "none", "the sky is black"),
         "probes": (False, "specular probes are not baked by this version"),
     }
@@ -257,10 +258,10 @@ def _describe(snapshot: Snapshot, light: Model, scene: Scene, trees: list[Topolo
     return outcome
 
 
-def _file_sizes(target: Path) -> dict[str, int]:
+def _file_sizes(cells: list[dict]) -> dict[str, int]:
     """Bytes on disk by kind."""
     sizes = dict.fromkeys(("tree", "local", "sun", "sky", "points", "probes"), 0)
-    for entry in folder.load_header(target)["cells"]:
+    for entry in cells:
         for name, file in entry["files"].items():
             sizes[name] += int(file["bytes"])
     return sizes

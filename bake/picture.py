@@ -6,6 +6,7 @@ Comes in: linear images. Goes out: a PNG to look at, or an OpenEXR file with eve
 from __future__ import annotations
 
 import io
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -43,13 +44,30 @@ def write_pictures(path: Path, baked: np.ndarray, traced: np.ndarray, covered: n
     ------
     SettingsError
         Another kind of file.
+    OSError
+        The file cannot be written.
     """
-    suffix = path.suffix.lower()
-    if suffix == ".exr":
+    check_path(path)
+    if path.suffix.lower() == ".exr":
         _write_exr(path, {"baked": baked, "traced": traced, "difference": baked - traced})
-    elif suffix == ".png":
-        _write_png(path, baked, traced, covered > 0)
     else:
+        _write_png(path, baked, traced, covered > 0)
+
+
+def check_path(path: Path) -> None:
+    """Refuse a name that no picture can be written to, before any work.
+
+    Parameters
+    ----------
+    path : Path
+        The picture.
+
+    Raises
+    ------
+    SettingsError
+        It is no .png or .exr.
+    """
+    if path.suffix.lower() not in (".exr", ".png"):
         raise SettingsError(f"{path}: write pictures as .png or .exr")
 
 
@@ -102,9 +120,7 @@ def _write_exr(path: Path, layers: dict[str, np.ndarray]) -> None:
         for number, letter in enumerate("RGB")
     }
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    scratch = path.with_name(path.name + ".part")
-    try:
-        OpenEXR.File(header, channels).write(str(scratch))
-        scratch.replace(path)
-    finally:
-        scratch.unlink(missing_ok=True)
+    with tempfile.TemporaryDirectory(prefix="gi_volumes_") as scratch:
+        written = Path(scratch) / "picture.exr"
+        OpenEXR.File(header, channels).write(str(written))
+        write_bytes_atomically(path, written.read_bytes())

@@ -10,7 +10,10 @@ import sys
 import time
 
 INTERVAL = 0.2
-"""Least time between two lines [s]."""
+"""Least time between two lines that a program or a terminal gets [s]."""
+
+LOG_INTERVAL = 10.0
+"""Least time between two lines of a log that nobody rewrites [s]."""
 
 
 class Progress:
@@ -27,6 +30,8 @@ class Progress:
         self._stage = ""
         self._stage_start = 0.0
         self._total = 1
+        self._first = 0
+        self._said = -1
         self._last = 0.0
         self._seconds: dict[str, float] = {}
         self._open_line = False
@@ -37,7 +42,7 @@ class Progress:
         self._close_stage()
         return {name: round(value, 3) for name, value in self._seconds.items()}
 
-    def stage(self, name: str, total: int = 1) -> None:
+    def stage(self, name: str, total: int = 1, done: int = 0) -> None:
         """Begin a stage, ending the one before.
 
         Parameters
@@ -46,11 +51,14 @@ class Progress:
             A word or two for people.
         total : int
             Units of work in it.
+        done : int
+            Units that were done before; they say nothing about the time left.
         """
         self._close_stage()
         self._end_line()
-        self._stage, self._total, self._last = name, max(total, 1), 0.0
-        self.show(0)
+        self._stage, self._total, self._first, self._said = name, max(total, 1), done, -1
+        self._last = time.monotonic() if self._is_log and total > 1 else -LOG_INTERVAL
+        self.show(done)
 
     def show(self, done: int) -> bool:
         """Say how much of the stage is done, unless that was said a moment ago.
@@ -66,11 +74,13 @@ class Progress:
             True: a callback that returns it lets the work go on.
         """
         now = time.monotonic()
-        if now - self._last >= INTERVAL or done == self._total:
-            self._last = now
-            spent = now - self._stage_start
-            left = spent / done * (self._total - done) if done else None
-            self._write(done, left)
+        interval = LOG_INTERVAL if self._is_log else INTERVAL
+        named = self._is_log and self._total == 1 and self._said >= 0
+        if done != self._said and not named and (now - self._last >= interval or done == self._total):
+            self._last, self._said = now, done
+            spent, fresh = now - self._stage_start, done - self._first
+            left = spent / fresh * (self._total - done) if fresh > 0 else None
+            self._write(done, 0.0 if done >= self._total else left)
         return True
 
     def finish(self, result: dict) -> None:
@@ -99,6 +109,17 @@ class Progress:
             print(json.dumps({"error": message}), flush=True)
         print(f"error: {message}", file=sys.stderr, flush=True)
 
+    def interrupt(self) -> None:
+        """End the line for people; programs get an error as their last line."""
+        self._end_line()
+        if self._as_json:
+            print(json.dumps({"error": "interrupted"}), flush=True)
+
+    @property
+    def _is_log(self) -> bool:
+        """Whether lines pile up where they are written."""
+        return not self._as_json and not sys.stderr.isatty()
+
     def _close_stage(self) -> None:
         """Add the running stage to the totals and go on counting."""
         now = time.monotonic()
@@ -113,13 +134,13 @@ class Progress:
             line = {"stage": self._stage, "done": done, "total": self._total, "seconds_left": seconds_left}
             print(json.dumps(line), flush=True)
             return
-        share = f"{100 * done / self._total:3.0f} %"
-        text = f"{self._stage}: {share}" + (f", {left:.0f} s left" if left is not None and done < self._total else "")
-        if sys.stderr.isatty():
+        share = f": {100 * done / self._total:3.0f} %" if self._total > 1 else ""
+        text = f"{self._stage}{share}" + (f", {left:.0f} s left" if left else "")
+        if self._is_log:
+            print(text, file=sys.stderr, flush=True)
+        else:
             print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
             self._open_line = True
-        elif done == self._total:
-            print(text, file=sys.stderr, flush=True)
 
     def _end_line(self) -> None:
         """Leave the line that is being rewritten."""

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..tree import grid as lattice
 from ..tree.grid import Grid
+from ..tree.suns import MAX_KEYS
 from .scene import Model, SunKeys, scene_suns
 from .snapshot import Snapshot, SnapshotError
 
@@ -23,6 +24,12 @@ QUALITIES = {"draft": (64, 6), "preview": (256, 8), "final": (1024, 12)}
 
 HEMISPHERE_KEYS = 16
 """Directions of a free sun."""
+
+MOST_LEVELS = 5
+"""Levels of voxels that --finest may ask for: 256 voxels along the edge of a first-level one."""
+
+COARSEST = 64
+"""Finest voxels may be this many times larger than the first level that suits the scene."""
 
 
 class SettingsError(ValueError):
@@ -76,6 +83,8 @@ def with_sky(snapshot: Snapshot, sky: str) -> tuple[Snapshot, str]:
         radiance = numbers(sky, "--sky", (1, 3))
         if (radiance < 0).any():
             raise SettingsError(f"--sky {sky}: radiance cannot be negative")
+        if (radiance > np.finfo(np.float32).max).any():
+            raise SettingsError(f"--sky {sky}: radiance must be a number of single precision")
         uniform = np.broadcast_to(radiance, (1, 1, 3)).astype(np.float32)
         snapshot = dataclasses.replace(snapshot, sky=uniform)
     return snapshot, "fixed" if (snapshot.sky > 0).any() else "none"
@@ -103,6 +112,7 @@ def sun_keys(snapshot: Snapshot, sun: str) -> SunKeys:
     """
     own = scene_suns(snapshot)
     if sun == "scene":
+        _check_count(len(own.toward), sun)
         return own
     if sun == "none":
         return SunKeys()
@@ -112,11 +122,50 @@ def sun_keys(snapshot: Snapshot, sun: str) -> SunKeys:
         toward = _read_arc(Path(sun.removeprefix("arc:")))
     else:
         toward = numbers(sun, "--sun", (3,))[None]
-    length = np.linalg.norm(toward, axis=1, keepdims=True)
-    if (length == 0).any():
-        raise SettingsError(f"--sun {sun}: a direction has no length")
+    _check_count(len(toward), sun)
     diameter = own.diameter[0] if len(own.diameter) else 0.0
-    return SunKeys((toward / length).astype(np.float32), np.full(len(toward), diameter, np.float32))
+    toward = unit(toward, f"--sun {sun}").astype(np.float32)
+    return SunKeys(toward, np.full(len(toward), diameter, np.float32))
+
+
+def _check_count(count: int, sun: str) -> None:
+    """Refuse more sun directions than a reader takes."""
+    if count > MAX_KEYS:
+        raise SettingsError(f"--sun {sun}: {count} directions; a bake holds at most {MAX_KEYS}")
+
+
+def has_free_sun(sun: str) -> bool:
+    """Say whether the sun's directions are keys to interpolate between, not suns that shine together.
+
+    Parameters
+    ----------
+    sun : str
+        As in `Settings`.
+
+    Returns
+    -------
+    bool
+        True for a hemisphere and an arc.
+    """
+    return sun == "hemisphere" or sun.startswith("arc:")
+
+
+def of_reference(settings: Settings) -> Settings:
+    """Settings of the light that a bake has when nobody says otherwise.
+
+    Parameters
+    ----------
+    settings : Settings
+        What a bake was asked for.
+
+    Returns
+    -------
+    Settings
+        With the scene's own sun instead of a free one, and its own sky instead of a changing one: what a
+        bake holds for other light, its reference has no need of.
+    """
+    sun = "scene" if has_free_sun(settings.sun) else settings.sun
+    return dataclasses.replace(settings, sun=sun, sky="scene" if settings.sky == "harmonics" else settings.sky)
 
 
 def model(snapshot: Snapshot, settings: Settings) -> tuple[Snapshot, Model]:
@@ -192,8 +241,9 @@ def choose_grid(corners: np.ndarray, origin: np.ndarray, finest: float) -> Grid:
         raise SettingsError(f"--finest {finest}: use a power of two, such as 0.25, 0.5 or 1")
     levels = 1 + math.ceil(math.log(grid.first_size / 2 / finest, lattice.BRANCH)) if finest < grid.first_size else 1
     levels = max(levels, 1)
-    if levels > 5:
-        raise SettingsError(f"--finest {finest}: too fine for a scene whose first level is {grid.first_size} m")
+    if levels > MOST_LEVELS or finest > COARSEST * grid.first_size:
+        wrong = "fine" if levels > MOST_LEVELS else "coarse"
+        raise SettingsError(f"--finest {finest}: too {wrong} for a scene whose first level is {grid.first_size} m")
     return Grid(finest * lattice.BRANCH ** (levels - 1), levels, tuple(origin))
 
 
@@ -229,6 +279,33 @@ def numbers(text: str, option: str, counts: tuple[int, ...]) -> np.ndarray:
     return values
 
 
+def unit(vectors: np.ndarray, what: str) -> np.ndarray:
+    """Directions of length 1.
+
+    Parameters
+    ----------
+    vectors : (n, 3) float64 ndarray
+        Finite, of any length but 0.
+    what : str
+        What they are, for the message.
+
+    Returns
+    -------
+    (n, 3) float64 ndarray
+        Unit vectors, exact for tiny and for huge lengths too.
+
+    Raises
+    ------
+    SettingsError
+        One has no length.
+    """
+    largest = np.abs(vectors).max(axis=1, keepdims=True, initial=0.0)
+    if (largest == 0).any():
+        raise SettingsError(f"{what}: direction {int(np.argmin(largest))} has no length")
+    vectors = vectors / largest
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
 def _read_arc(path: Path) -> np.ndarray:
     """(n, 3) directions, one line each."""
     try:
@@ -256,3 +333,23 @@ def check_scene(snapshot: Snapshot) -> None:
     """
     if not len(snapshot.geometry.triangles) or not len(snapshot.geometry.instance_mesh):
         raise SnapshotError("the scene has no triangles to bake; add a mesh that is visible in renders")
+
+
+def check_triangles(corners: np.ndarray) -> None:
+    """Refuse a scene with no surface.
+
+    Parameters
+    ----------
+    corners : (n, 3, 3) float32 ndarray
+        Triangles relative to the origin [m].
+
+    Raises
+    ------
+    SnapshotError
+        A corner lies beyond single precision, or no triangle has an area.
+    """
+    if not np.isfinite(corners).all():
+        raise SnapshotError("a vertex is too far away for single precision; check the scale of the objects")
+    edges = corners[:, 1:].astype(np.float64) - corners[:, :1]
+    if not np.cross(edges[:, 0], edges[:, 1]).any():
+        raise SnapshotError("every triangle of the scene has zero area; check the scale of the objects")

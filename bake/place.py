@@ -1,0 +1,196 @@
+"""The folder that a bake writes to, and the scene that lies in it.
+
+Comes in: finished cells. Goes out: a folder that always holds one bake, the one before or this one. Cells appear
+there whole; files of another bake go when this one's first cell is there to replace them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from ..tree import container, folder
+from ..tree.topology import Topology
+from ..tree.verify import Defect
+from . import snapshot_file
+from .settings import SettingsError
+from .snapshot import Snapshot
+
+SNAPSHOT_NAME = "scene.giv"
+"""The snapshot inside a bake's folder."""
+
+STAGING = ".gi_volumes_"
+"""How the name begins of a folder where a cell's files lie until all of them are written."""
+
+
+def check_target(target: Path) -> None:
+    """Refuse a folder that a bake must not write to.
+
+    Parameters
+    ----------
+    target : Path
+        Folder of a bake; it may be missing.
+
+    Raises
+    ------
+    SettingsError
+        It is a file, or another program's `world.json` is in it.
+    """
+    if target.exists() and not target.is_dir():
+        raise SettingsError(f"{target}: this is a file; a bake needs a folder")
+    if (target / folder.WORLD).is_dir():
+        raise SettingsError(f"{target / folder.WORLD}: this is a folder; choose another folder for the bake")
+    try:
+        content = json.loads((target / folder.WORLD).read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return
+    if not isinstance(content, dict) or content.get("format") != folder.WORLD_FORMAT:
+        raise SettingsError(f"{target / folder.WORLD}: another program's file; choose another folder for the bake")
+
+
+def scene_defects(target: Path) -> list[Defect]:
+    """Find what is wrong with the snapshot that lies in a bake's folder.
+
+    Parameters
+    ----------
+    target : Path
+        Folder of a bake.
+
+    Returns
+    -------
+    list of Defect
+        Empty for the undamaged snapshot of the scene that was baked.
+    """
+    try:
+        found = snapshot_file.digest(snapshot_file.load(target / SNAPSHOT_NAME))
+    except FileNotFoundError:
+        return [Defect(SNAPSHOT_NAME, "the file is missing")]
+    except container.FileError as error:
+        return [Defect(SNAPSHOT_NAME, f"byte {error.offset}: {error.reason}")]
+    except (OSError, ValueError) as error:
+        return [Defect(SNAPSHOT_NAME, str(error))]
+    with contextlib.suppress(OSError, container.FileError):
+        if folder.load_header(target)["snapshot"] != found:
+            return [Defect(SNAPSHOT_NAME, "the snapshot is of another scene than the bake")]
+    return []
+
+
+class Place:
+    """The folder of a bake. Another bake in it stays whole until this one has something to put in its place.
+
+    Parameters
+    ----------
+    target : Path
+        The folder; it is made if needed.
+    snapshot : Snapshot
+        The scene, stored beside the cells.
+    header : dict
+        For `folder.assemble`.
+
+    Attributes
+    ----------
+    target : Path
+        The folder.
+    identity : str
+        Hash of the bake.
+    taken : bool
+        Whether the folder holds this bake, with as many cells as there are.
+
+    Raises
+    ------
+    OSError
+        The folder cannot be written; it is as it was before.
+    """
+
+    def __init__(self, target: Path, snapshot: Snapshot, header: dict) -> None:
+        self.target, self.identity, self.taken = target, header["bake"], False
+        self._snapshot, self._header = snapshot, header
+        is_new = not target.exists()
+        target.mkdir(parents=True, exist_ok=True)
+        try:
+            _check_writable(target)
+            if _bake_in(target) in (None, self.identity):
+                self.take()
+        except OSError:
+            if is_new:
+                with contextlib.suppress(OSError):
+                    target.rmdir()
+            raise
+
+    def take(self) -> None:
+        """Make the folder this bake's: its scene, its list of cells, and no files of another bake.
+
+        Raises
+        ------
+        OSError
+            A file cannot be written or removed.
+        """
+        if self.taken:
+            return
+        is_ours = _bake_in(self.target) == self.identity
+        snapshot_file.save(self._snapshot, self.target / SNAPSHOT_NAME)
+        folder.assemble(self.target, self._header)
+        self.taken = True
+        if not is_ours:
+            _remove_other_bakes(self.target, self.identity)
+
+    def write_cell(self, tree: Topology, payloads: dict, valid: np.ndarray, offset: np.ndarray) -> None:
+        """Put all files of a cell into the folder, or none; the tree, which makes a cell count, comes last.
+
+        Parameters
+        ----------
+        tree : Topology
+            The cell's tree.
+        payloads : dict of str to (size, K, 9, 3) float32 ndarray
+            As for `folder.write_cell`.
+        valid : (size,) bool ndarray
+            Which voxels have a data point.
+        offset : (size, 3) int8 ndarray
+            Data point minus voxel centre, in voxel sizes / 254.
+
+        Raises
+        ------
+        OSError
+            A file cannot be written.
+        """
+        with tempfile.TemporaryDirectory(prefix=STAGING, dir=self.target) as staging:
+            folder.write_cell(staging, tree, payloads, valid, offset, {"bake": self.identity})
+            self.take()
+            for path in sorted(Path(staging).iterdir(), key=lambda path: path.suffix == ".tree"):
+                path.replace(self.target / path.name)
+
+
+def _check_writable(target: Path) -> None:
+    """Refuse a folder that nothing can be put into, before hours of work."""
+    try:
+        with tempfile.TemporaryDirectory(prefix=STAGING, dir=target):
+            pass
+    except OSError as error:
+        raise OSError(error.errno, f"cannot write: {error.strerror}", str(target)) from None
+
+
+def _bake_in(target: Path) -> str | None:
+    """Hash of the bake that a folder holds; None without one."""
+    try:
+        return folder.load_header(target)["bake"]
+    except (OSError, container.FileError):
+        return None
+
+
+def _remove_other_bakes(target: Path, identity: str) -> None:
+    """Remove the files of cells that this bake did not write."""
+    for path in folder.files(target):
+        if path.name.startswith("cell_") and not _belongs(path, identity):
+            path.unlink(missing_ok=True)
+
+
+def _belongs(path: Path, identity: str) -> bool:
+    """Whether a cell's file is whole and of this bake."""
+    try:
+        return container.read(path).meta.get("bake") == identity
+    except (OSError, container.FileError):
+        return False
