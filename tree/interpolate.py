@@ -81,6 +81,8 @@ def weigh(data: DataPoints, points: np.ndarray, normals: np.ndarray) -> tuple[np
         Sum 1; all 0 only in a bake without any valid data point.
     """
     row, weight = np.zeros((len(points), 8), np.int64), np.zeros((len(points), 8))
+    if not data.valid.any():
+        return row, weight
     limit = FAR * data.grid.first_size
     points = np.clip(points, -limit, limit)
     left = np.arange(len(points))
@@ -106,7 +108,7 @@ def _neighbourhood(
     place = points / size - 0.5 - base
     coords = base.astype(np.int64)[:, None] + CORNERS
     row = data.atlas.find(level, coords.reshape(-1, 3)).reshape(-1, 8)
-    valid = (row >= 0) & data.valid[np.maximum(row, 0)] if len(data.valid) else np.zeros(row.shape, bool)
+    valid = (row >= 0) & data.valid[row]
     row = np.where(valid, row, 0)
     weight = np.where(valid, np.where(CORNERS, place[:, None], 1.0 - place[:, None]).prod(axis=2), 0.0)
     if normals is not None:
