@@ -43,7 +43,7 @@ class GIVOLUMES_OT_bake(bpy.types.Operator):
         except properties.SettingsError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        self._steps = started.steps(lambda: bpy.context.evaluated_depsgraph_get())
+        self._steps = started.steps()
         if bpy.app.background or not self.options.is_invoke:
             return self._run_to_end(started)
         self._shown = None

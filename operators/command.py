@@ -14,10 +14,11 @@ from pathlib import Path
 import bpy
 
 from . import bake_operator, dependencies, job, properties, snapshot_command, worker
-from .snapshot_command import SUFFIXES, one_line
+from .snapshot_command import one_line
 
 NAME = "gi_volumes"
 SCENE_COMMANDS = ("bake", "reference")
+SCENE_SUFFIXES = (".blend", ".glb", ".gltf")
 SNAPSHOT_SUFFIX = ".giv"
 
 
@@ -57,12 +58,12 @@ def _with_snapshot(argv: list[str], snapshot: Path) -> list[str]:
     """The arguments with the scene read and replaced by its snapshot."""
     if argv[:1] not in [[name] for name in SCENE_COMMANDS] or {"-h", "--help"} & set(argv):
         return argv
-    scene = next((text for text in argv[1:] if Path(text).suffix.lower() in (*SUFFIXES, SNAPSHOT_SUFFIX)), None)
+    scene = next((text for text in argv[1:] if Path(text).suffix.lower() in (*SCENE_SUFFIXES, SNAPSHOT_SUFFIX)), None)
     if scene is not None and Path(scene).suffix.lower() == SNAPSHOT_SUFFIX:
         return argv
     rest = [text for text in argv[1:] if text != scene]
     if scene is None:
-        job.write_snapshot(bpy.context.evaluated_depsgraph_get(), snapshot)
+        job.write_snapshot(snapshot)
     else:
         snapshot_command.write(Path(scene), snapshot)
     return [argv[0], str(snapshot), *rest, *(_defaults(rest) if argv[0] == "bake" else [])]

@@ -7,7 +7,7 @@ tick in a window. One job runs at a time; `current` and `last` are what the pane
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,13 +53,8 @@ class Job:
         self._worker: Worker | None = None
         self._stopping = False
 
-    def steps(self, depsgraph: Callable[[], bpy.types.Depsgraph]) -> Iterator[Progress]:
-        """Run the job; afterwards `outcome` is set.
-
-        Parameters
-        ----------
-        depsgraph : callable
-            Returns the evaluated dependency graph; called once, after the first step.
+    def steps(self) -> Iterator[Progress]:
+        """Run the job; afterwards `outcome` is set. The scene is read in the second step.
 
         Yields
         ------
@@ -70,7 +65,7 @@ class Job:
         try:
             with tempfile.TemporaryDirectory(prefix="gi_volumes_", dir=bpy.app.tempdir) as scratch:
                 snapshot = Path(scratch) / "scene.giv"
-                write_snapshot(depsgraph(), snapshot)
+                write_snapshot(snapshot)
                 yield from self._follow(self._command(snapshot), Path(scratch))
         except (OSError, ValueError) as error:
             self.outcome = Outcome("failed", one_line(error))
@@ -109,13 +104,11 @@ class Job:
         self.outcome = _outcome(worker)
 
 
-def write_snapshot(depsgraph: bpy.types.Depsgraph, path: Path) -> None:
-    """Read an evaluated scene and write its snapshot.
+def write_snapshot(path: Path) -> None:
+    """Read the open scene and write its snapshot.
 
     Parameters
     ----------
-    depsgraph : bpy.types.Depsgraph
-        The evaluated dependency graph.
     path : Path
         File to create.
 
@@ -130,7 +123,7 @@ def write_snapshot(depsgraph: bpy.types.Depsgraph, path: Path) -> None:
     from ..bake import snapshot_file
     from . import extract
 
-    snapshot_file.save(extract.extract(depsgraph), path)
+    snapshot_file.save(extract.extract(bpy.context), path)
 
 
 def _outcome(worker: Worker) -> Outcome:

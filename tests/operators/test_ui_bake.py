@@ -50,13 +50,15 @@ def main(argv, extract):
 """
 STAND_IN_SNAPSHOT_FILE = "def save(snapshot, path):\n    open(path, 'wb').write(snapshot)\n"
 STAND_IN_EXTRACT = """
-def extract(depsgraph):
-    if not depsgraph.objects:
+def extract(context):
+    if not context.scene.objects:
         raise ValueError("the scene has no\\n   geometry")
-    return b"snapshot of %d objects" % len(depsgraph.objects)
+    return b"snapshot of %d objects" % len(context.scene.objects)
 
 def from_file(path):
     import bpy
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file")
     bpy.ops.wm.open_mainfile(filepath=str(path))
     return b"snapshot of a file"
 """
@@ -167,7 +169,7 @@ print(failure(bpy.ops.gi_volumes.clear))
 def test_a_defect_of_ours_does_not_leave_a_bake_running_for_ever(blender):
     blender("""
 from bl_ext.dev.gi_volumes.operators import extract, job
-def broken(depsgraph):
+def broken(context):
     raise ZeroDivisionError("a defect")
 extract.extract = broken
 assert "a defect" in failure(bpy.ops.gi_volumes.bake)
@@ -201,7 +203,7 @@ def test_disabling_the_extension_stops_a_bake_that_runs_and_leaves_nothing(blend
         """
 import time
 from bl_ext.dev.gi_volumes.operators import job
-steps = job.begin(scene).steps(bpy.context.evaluated_depsgraph_get)
+steps = job.begin(scene).steps()
 while job.current.progress.stage != "Tracing" or not (output / "started").exists():
     next(steps)
     time.sleep(0.05)
@@ -221,7 +223,7 @@ def test_cancel_keeps_what_is_finished(blender):
 import time
 from bl_ext.dev.gi_volumes.operators import job
 assert not bpy.ops.gi_volumes.cancel.poll()
-steps = job.begin(scene).steps(bpy.context.evaluated_depsgraph_get)
+steps = job.begin(scene).steps()
 while not (output / "started").exists():
     next(steps)
     time.sleep(0.05)
