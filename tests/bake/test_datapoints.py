@@ -80,6 +80,18 @@ def test_points_inside_a_thin_wall_move_out_by_at_most_half_a_voxel_into_free_sp
     assert sides[off_center].mean() > 0.9
 
 
+def test_offsets_stay_within_half_a_voxel_where_a_wall_is_nearly_as_thick_as_their_reach():
+    size = 1.0
+    for thickness in (0.88, 0.92, 0.96, 1.0):
+        low, high = np.array([-20, -thickness / 2, -20]), np.array([20, thickness / 2, 20])
+        centers = grid((-3, -0.1, -3), (3, 0.1, 3), 7)
+        found = placed(scene_of(build_scenes.box(low, high)), centers, size)
+        moved = found.position.T.astype(float)
+        assert np.abs(found.offset.astype(int)).max() <= OFFSET_STEPS // 2
+        assert not in_box(moved[found.valid], low, high).any()
+        assert np.array_equal(found.offset.any(axis=1), found.valid)
+
+
 def test_a_wall_thicker_than_the_voxel_s_reach_leaves_its_middle_invalid_and_its_skin_valid():
     size = 1.0
     scene = scene_of(build_scenes.box((-40, -1, -40), (40, 1, 40)))

@@ -150,6 +150,9 @@ def agree(one: np.ndarray, two: np.ndarray) -> bool:
     return True
 
 
+GLASS = Material("glass", Channel((0.9, 0.7, 0.8)), transmission=Channel((1.0,)), specular_level=0.0)
+
+
 def emitter_cases() -> dict[str, tuple]:
     """Parts, images and texture coordinates of rooms lit by one panel."""
     rng = np.random.default_rng(6)
@@ -163,15 +166,16 @@ def emitter_cases() -> dict[str, tuple]:
         "plain": ([floor, (panel, glow(3.0, 2.0, 1.0))], (), None),
         "textured": ([floor, (panel, textured)], (image,), np.array(square * 2, np.float32)),
         "see-through": ([floor, (panel, pane)], (), None),
+        "behind glass": ([floor, (panel, glow(3.0, 2.0, 1.0)), (build_scenes.plane(3.0, 0.95), GLASS)], (), None),
         "with slivers and points": ([floor, *panels()], (), None),
     }
 
 
-@pytest.mark.parametrize("name", ["plain", "textured", "see-through", "with slivers and points"])
+@pytest.mark.parametrize("name", ["plain", "textured", "see-through", "behind glass", "with slivers and points"])
 def test_light_is_the_same_with_and_without_shadow_rays_to_the_emitters_and_a_wrong_weight_is_caught(name):
     parts, images, uvs = emitter_cases()[name]
     scene = prepare(build_scenes.snapshot(parts, images=images, uvs=uvs), Model())
-    position = np.array([[0.3, -0.2, 0.9], [0.1, 0.5, -0.6], [0.5, 0.05, 0.3]], np.float32)
+    position = np.array([[0.3, -0.2, 0.9], [0.1, 0.5, -0.6], [0.8, 0.05, 0.3]], np.float32)
     blind = dataclasses.replace(scene, emitters=Blind())
     for sensor in (SurfacePoints(np.array([[0, 0, 0.6], [0, 0, 0], [1, 1, 0.8]], np.float32)), DataPoints()):
         with_rays = estimates(scene, sensor, position, 512)
