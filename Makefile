@@ -43,7 +43,7 @@ $(DEMO)/courtyard.blend: $(wildcard demo/*.py) | setup
 
 bake: setup $(DEMO)/courtyard.blend
 	$(RUN) -m gi_volumes bake $(DEMO)/courtyard.blend -o $(DEMO)/bake
-	$(RUN) -m gi_volumes compare $(DEMO)/bake $(DEMO)/courtyard.blend -o $(DEMO)/compare.png
+	$(RUN) -m gi_volumes compare $(DEMO)/bake -o $(DEMO)/compare.png
 	@echo "The bake is in $(DEMO)/bake; baked, path-traced and their difference are in $(DEMO)/compare.png"
 
 lint: setup
