@@ -20,8 +20,9 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 CANDIDATES = 8
 """Up to this many lamps are all weighed; of more, this many are drawn by their power and weighed."""
 
-NEAREST = np.float32(1e-3)
-"""Closer than this fraction of a metre a lamp's irradiance is held: a point lamp on a surface stays finite."""
+NEAREST, NEAREST_SHARE = 1e-3, 1e-5
+"""Closer than 1 mm, or this share of the scene's size, a lamp's irradiance is held: a point lamp on a surface stays
+finite."""
 
 INSIDE = np.float32(0.01)
 """Least of 1 - (r / d)^2: a point on or inside a spherical lamp gets a finite, wide disk."""
@@ -54,9 +55,12 @@ class Lamps:
         The ones to use; suns are not allowed.
     origin : (3,) float64 ndarray
         The snapshot's origin [m].
+    scene_size : float
+        Longest side of the scene's bounds [m].
     """
 
-    def __init__(self, lights: Lights, rows: np.ndarray, origin: np.ndarray) -> None:
+    def __init__(self, lights: Lights, rows: np.ndarray, origin: np.ndarray, scene_size: float) -> None:
+        self._nearest = np.float32(min(NEAREST, NEAREST_SHARE * scene_size))
         self.count = len(rows)
         self._kind = lights.kind[rows]
         self._position = (lights.position[rows] - origin).astype(np.float32).T
@@ -122,7 +126,7 @@ class Lamps:
         if normal is None:
             return value
         cosine = np.maximum(warp.dot(normal, toward), 0)
-        return value * cosine / np.sqrt(np.maximum(warp.dot(toward, toward), NEAREST * NEAREST))
+        return value * cosine / np.sqrt(np.maximum(warp.dot(toward, toward), self._nearest**2))
 
     def _evaluate(self, lamp: np.ndarray, position: np.ndarray, u1: np.ndarray, u2: np.ndarray):
         """(vector to a point of the lamp, irradiance on a surface facing it over the lamp's strength)."""
@@ -141,7 +145,7 @@ class Lamps:
         A disk of the lamp's radius brings I / (d^2 + r^2), Blender's soft falloff. The disk that covers as much of
         the hemisphere as a sphere of that radius is wider and brings I / d^2.
         """
-        distance = np.maximum(np.sqrt(warp.dot(center, center)), NEAREST)
+        distance = np.maximum(np.sqrt(warp.dot(center, center)), self._nearest)
         axis = center / distance
         toward, wider = center, np.float32(1)
         radius, is_sphere = self._size[:, lamp]
@@ -151,7 +155,7 @@ class Lamps:
             x, y = warp.disk(u1, u2)
             tangent, bitangent = warp.frame(axis)
             toward = center + (tangent * x + bitangent * y) * (radius * np.sqrt(wider))
-        squared = np.maximum(warp.dot(toward, toward), NEAREST * NEAREST)
+        squared = np.maximum(warp.dot(toward, toward), self._nearest**2)
         facing = warp.dot(toward, axis) / np.sqrt(squared)
         return toward, wider * np.maximum(facing, 0) / squared * self._cone(lamp, axis)
 
@@ -175,7 +179,7 @@ class Lamps:
             x, y = np.where(ellipse, disk_x / 2, x), np.where(ellipse, disk_y / 2, y)
             area = np.where(ellipse, area * np.float32(np.pi / 4), area)
         toward = center + self._x[:, lamp] * (x * self._size[0, lamp]) + self._y[:, lamp] * (y * self._size[1, lamp])
-        squared = np.maximum(warp.dot(toward, toward), NEAREST * NEAREST)
+        squared = np.maximum(warp.dot(toward, toward), self._nearest**2)
         z = self._z[:, lamp]
         cosine = (toward[0] * z[0] + toward[1] * z[1] + toward[2] * z[2]) / np.sqrt(squared)
         return toward, area * np.maximum(cosine, 0) / squared

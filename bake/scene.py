@@ -94,12 +94,13 @@ def prepare(snapshot: Snapshot, model: Model) -> Scene:
     surfaces = Surfaces(snapshot, soup)
     lamp_rows = np.flatnonzero((snapshot.lights.kind != LightKind.SUN) & (snapshot.lights.strength > 0).any(axis=1))
     reflector_rows = lamp_rows[snapshot.lights.reflector[lamp_rows]]
+    tracer = Tracer(soup.corners, surfaces.transparent)
     return Scene(
         soup=soup,
-        tracer=Tracer(soup.corners, surfaces.transparent),
+        tracer=tracer,
         surfaces=surfaces,
-        lamps=Lamps(snapshot.lights, lamp_rows, snapshot.origin),
-        reflectors=Lamps(snapshot.lights, reflector_rows, snapshot.origin),
+        lamps=Lamps(snapshot.lights, lamp_rows, snapshot.origin, tracer.size),
+        reflectors=Lamps(snapshot.lights, reflector_rows, snapshot.origin, tracer.size),
         emitters=Emitters(soup, surfaces),
         sky=Sky(snapshot.sky),
         model=model,

@@ -131,6 +131,11 @@ class Sampler:
         Number of the block's first sample.
     count : int
         Samples in the block.
+
+    Notes
+    -----
+    Error: some pairs of high dimensions are poorly stratified at a few hundred samples. Padded two-dimensional nets
+    (Burley 2020), where every pair is good, were 2 to 20 % noisier at 64 to 1,024 paths in rooms and courts.
     """
 
     def __init__(self, keys: np.ndarray, first: int, count: int) -> None:

@@ -15,11 +15,12 @@ from statistics_checks import SIGNIFICANCE, chi_square, standard_error
 SAMPLES = 100_000
 STANDARD_ERRORS = 3.5
 ORIGIN = np.zeros(3)
+SIZE = 100.0  # of the scene [m]: lamps are held within NEAREST
 
 
 def made(*rows: dict) -> Lamps:
     lights = build_scenes.lamps(*rows)
-    return Lamps(lights, np.arange(len(rows)), ORIGIN)
+    return Lamps(lights, np.arange(len(rows)), ORIGIN, SIZE)
 
 
 def uniform(count: int = SAMPLES, seed: int = 1) -> tuple[np.ndarray, ...]:
@@ -178,3 +179,17 @@ def test_lamps_that_bring_nothing_are_never_lit():
     assert not sample.irradiance.any()
     flat = made({**dark, "position": (0, 0, 1.0), "size": (0, 1)})
     assert not flat.sample(np.zeros((3, 100), np.float32), None, uniform(100)).lit.any()
+
+
+def test_a_scene_a_tenth_of_a_millimetre_wide_is_lit_like_the_same_scene_a_metre_wide():
+    lamp = {"position": (0, 0, 0.5), "strength": (1, 1, 1)}
+    scale = 1e-4
+    large = build_scenes.lamps(lamp)
+    small = build_scenes.lamps({**lamp, "position": (0, 0, 0.5 * scale)})
+    point, up = np.zeros((3, 1), np.float32), np.array([[0], [0], [1]], np.float32)
+    u = tuple(np.full(1, 0.5, np.float32) for _ in range(4))
+    found = [
+        Lamps(lights, np.arange(1), ORIGIN, size).sample(point, up, u).irradiance[0, 0]
+        for lights, size in ((large, 1.0), (small, scale))
+    ]
+    assert found[1] * scale**2 == pytest.approx(found[0], rel=1e-5)
