@@ -132,9 +132,12 @@ class Place:
         if self.taken:
             return
         is_ours = _bake_in(self.target) == self.identity
-        snapshot_file.save(self._snapshot, self.target / SNAPSHOT_NAME)
-        folder.assemble(self.target, self._header)
-        self.taken = True
+        with tempfile.TemporaryDirectory(prefix=STAGING, dir=self.target) as staging:
+            scene = Path(staging) / SNAPSHOT_NAME
+            snapshot_file.save(self._snapshot, scene)
+            folder.assemble(self.target, self._header)
+            self.taken = True
+            scene.replace(self.target / SNAPSHOT_NAME)
         if not is_ours:
             _remove_other_bakes(self.target, self.identity)
 
