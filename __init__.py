@@ -41,7 +41,7 @@ def load(folder: Path | str) -> World:
     Returns
     -------
     World
-        The bake; its cells are read when they are first needed.
+        The bake, read whole and checked.
 
     Raises
     ------

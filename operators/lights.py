@@ -113,7 +113,8 @@ class Lamps:
         radius = data.shadow_soft_size
         share = 1.0 if data.normalize else (4 * math.pi * radius**2 if radius > 0 else POINT_AREA)
         cone = self._cone(data, scale, name) if data.type == "SPOT" else no_cone
-        return KINDS[data.type], color * share / (4 * math.pi), (radius, 0.0), cone
+        is_sphere = 0.0 if data.use_soft_falloff else 1.0
+        return KINDS[data.type], color * share / (4 * math.pi), (radius, is_sphere), cone
 
     def _cone(self, data: bpy.types.SpotLight, scale: np.ndarray, name: str) -> tuple[float, float]:
         """Cosine of half the cone and the blend; a lamp's scale widens or narrows its cone."""
