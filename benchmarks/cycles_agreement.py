@@ -1,7 +1,8 @@
 """Compares our path-traced reference with Cycles, transport by transport, on surface points of a scene.
 
     python benchmarks/cycles_agreement.py SCENE [--points N] [--samples S] [--paths P] [--bounces B]
-                                          [--materials diffuse|original] [--against ours|cycles]
+                                          [--transports sky,sun,local] [--materials diffuse|original]
+                                          [--keep-coincident] [--worst K]
 
 Comes in: a .blend, .glb or .gltf file; what lacks a sky or a sun gets one. Goes out: a line for each transport, and
 a row of agreement.csv. With diffuse materials Cycles models what we model, so that the difference has to be noise;
@@ -20,7 +21,7 @@ from pathlib import Path
 
 import bpy
 import numpy as np
-from gi_volumes.benchmarks import cycles_judge, scene_edits, surface_points
+from gi_volumes.benchmarks import coincident_faces, cycles_judge, scene_edits, surface_points
 
 RESULTS = Path(__file__).with_name("agreement.csv")
 TRANSPORTS = ("sky", "sun", "local")
@@ -51,6 +52,10 @@ class Agreement:
         Root mean square difference, relative to the mean.
     noise : float
         The same as the noise of both explains.
+    z : float
+        `difference` in units of its error.
+    channel_z : float
+        The same of the channel, red, green or blue, that is furthest off.
     """
 
     mean: float
@@ -59,6 +64,8 @@ class Agreement:
     correlation: float
     rmse: float
     noise: float
+    z: float
+    channel_z: float
 
 
 def agreement(ours: np.ndarray, judge: np.ndarray) -> Agreement:
@@ -77,22 +84,52 @@ def agreement(ours: np.ndarray, judge: np.ndarray) -> Agreement:
     means, variances = zip(*(_moments(runs) for runs in (ours, judge)), strict=True)
     scale = means[1].mean()
     if scale == 0:
-        return Agreement(0.0, *(5 * [math.nan]))
+        return Agreement(0.0, *(7 * [math.nan]))
     apart, variance = means[0] - means[1], variances[0] + variances[1]
+    error = np.sqrt(variance.sum()) / len(apart)
     return Agreement(
         mean=float(scale),
         difference=float(apart.mean() / scale),
-        error=float(np.sqrt(variance.sum()) / len(apart) / scale),
+        error=float(error / scale),
         correlation=float(np.corrcoef(*means)[0, 1]),
         rmse=float(np.sqrt((apart**2).mean()) / scale),
         noise=float(np.sqrt(variance.mean()) / scale),
+        z=float(apart.mean() / error),
+        channel_z=max((_pooled_z(ours[..., k], judge[..., k]) for k in range(3)), key=abs),
     )
+
+
+def worst(ours: np.ndarray, judge: np.ndarray, count: int) -> np.ndarray:
+    """Find the points that a difference of the pooled means comes from.
+
+    Parameters
+    ----------
+    ours, judge : (k, n, 3) ndarray [W/m2]
+        As in `agreement`.
+    count : int
+        How many.
+
+    Returns
+    -------
+    (count,) int64 ndarray
+        Rows, those that are furthest apart first.
+    """
+    apart = np.abs(_moments(ours)[0] - _moments(judge)[0])
+    return np.argsort(-apart, kind="stable")[:count]
 
 
 def _moments(runs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(n,) mean over runs and channels, and the variance of that mean."""
-    grey = np.asarray(runs, np.float64).mean(axis=2)
+    runs = np.asarray(runs, np.float64)
+    grey = runs.mean(axis=2) if runs.ndim == 3 else runs
     return grey.mean(axis=0), grey.var(axis=0, ddof=1) / len(grey)
+
+
+def _pooled_z(ours: np.ndarray, judge: np.ndarray) -> float:
+    """Difference of the means over all points of one channel (k, n), in units of its error; 0 where neither varies."""
+    (mine, variance), (other, other_variance) = _moments(ours), _moments(judge)
+    error = np.sqrt((variance + other_variance).sum())
+    return float((mine - other).sum() / error) if error > 0 else 0.0
 
 
 def open_scene(path: Path) -> list[str]:
@@ -146,7 +183,7 @@ def our_estimator(points: np.ndarray, normals: np.ndarray, paths: int, bounces: 
     from gi_volumes.bake import reference
     from gi_volumes.operators import extract
 
-    snapshot = extract.extract(bpy.context.evaluated_depsgraph_get())
+    snapshot = extract.extract(bpy.context)
     suns = snapshot.lights.strength[snapshot.lights.kind == reference.LightKind.SUN]
 
     def estimate(transport: str) -> np.ndarray:
@@ -186,6 +223,10 @@ def main() -> None:
     """Compare, print, and append to the results."""
     options = _parse()
     added = open_scene(options.scene)
+    print(f"{options.scene.name}: added {', '.join(added) or 'nothing'}")
+    if not options.keep_coincident:
+        removed, left = coincident_faces.remove_coincident()
+        print(f"removed {removed} faces that lie in others; {100 * left:.2f} % of the area still lies in others")
     points, normals = surface_points.pick(surface_points.world_triangles(), options.points, options.seed)
     if options.against == "ours":
         ours = our_estimator(points, normals, options.paths, options.bounces)
@@ -194,10 +235,13 @@ def main() -> None:
     judge = cycles_estimator(points, normals, options.samples, options.bounces, FIRST_SEED)
     if options.materials == "diffuse":
         scene_edits.make_diffuse()
-    print(f"{options.scene.name}: {len(points)} points, added {', '.join(added) or 'nothing'}")
-    for transport in TRANSPORTS:
-        result = agreement(ours(transport), judge(transport))
-        print(_line(transport, result))
+    for transport in options.transports.split(","):
+        runs = ours(transport), judge(transport)
+        result = agreement(*runs)
+        print(_line(transport, result), flush=True)
+        for row in worst(*runs, options.worst):
+            estimates = "   ".join(f"{part[:, row].mean():.5f} (runs {part[:, row].mean(axis=1)})" for part in runs)
+            print(f"    at {points[row].round(3)} facing {normals[row].round(3)}: {estimates}")
         if options.record:
             _append(options, transport, result)
 
@@ -206,6 +250,7 @@ def _parse() -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scene", type=Path, help=".blend, .glb or .gltf file")
+    parser.add_argument("--transports", default=",".join(TRANSPORTS), help="with commas between")
     parser.add_argument("--points", type=int, default=1000)
     parser.add_argument("--samples", type=int, default=128, help="of Cycles for each point, seed and pass")
     parser.add_argument("--paths", type=int, default=512, help="of ours for each point and seed")
@@ -215,6 +260,8 @@ def _parse() -> argparse.Namespace:
     parser.add_argument(
         "--against", choices=("ours", "cycles"), default="ours", help="cycles: the judge against itself"
     )
+    parser.add_argument("--keep-coincident", action="store_true", help="faces that lie in others stay in the scene")
+    parser.add_argument("--worst", type=int, default=0, help="print so many points that are furthest apart")
     parser.add_argument("--no-record", dest="record", action="store_false", help="leave agreement.csv alone")
     return parser.parse_args()
 
@@ -223,14 +270,14 @@ def _line(transport: str, result: Agreement) -> str:
     """A result for people."""
     return (
         f"{transport:6} mean {result.mean:9.5f} W/m2   difference {100 * result.difference:+7.3f} % "
-        f"+- {100 * result.error:.3f} %   correlation {result.correlation:.4f}   "
-        f"RMSE {100 * result.rmse:.1f} % (noise {100 * result.noise:.1f} %)"
+        f"+- {100 * result.error:.3f} % (z {result.z:+.1f}, channel {result.channel_z:+.1f})   "
+        f"correlation {result.correlation:.4f}   RMSE {100 * result.rmse:.1f} % (noise {100 * result.noise:.1f} %)"
     )
 
 
 def _append(options: argparse.Namespace, transport: str, result: Agreement) -> None:
     """Add a row to the results, under a header if it is the first."""
-    names = ("points", "samples", "paths", "bounces", "seed", "materials", "against")
+    names = ("points", "samples", "paths", "bounces", "seed", "materials", "against", "keep_coincident")
     row = {"commit": _commit(), "blender": bpy.app.version_string, "scene": options.scene.name, "transport": transport}
     row |= {name: getattr(options, name) for name in names}
     row |= {name: f"{value:.6g}" for name, value in asdict(result).items()}

@@ -25,8 +25,13 @@ CLEARANCE = 0.02
 CANDIDATES_PER_POINT = 4
 
 
-def world_triangles() -> np.ndarray:
+def world_triangles(instanced: bool = False) -> np.ndarray:
     """Read the triangles of everything that renders.
+
+    Parameters
+    ----------
+    instanced : bool
+        Only of instances that are no objects of their own.
 
     Returns
     -------
@@ -36,8 +41,10 @@ def world_triangles() -> np.ndarray:
     parts = [np.zeros((0, 3, 3))]
     for instance in bpy.context.evaluated_depsgraph_get().object_instances:
         if instance.object.type == "MESH" and not instance.object.hide_render:
+            if instanced and not instance.is_instance:
+                continue
             matrix = np.array(instance.matrix_world)
-            corners = _mesh_triangles(instance.object.data) @ matrix[:3, :3].T + matrix[:3, 3]
+            corners = mesh_triangles(instance.object.data) @ matrix[:3, :3].T + matrix[:3, 3]
             parts.append(corners[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else corners)
     return np.concatenate(parts)
 
@@ -83,8 +90,19 @@ def pick(triangles: np.ndarray, count: int, seed: int) -> tuple[np.ndarray, np.n
     return points[free], normals[free]
 
 
-def _mesh_triangles(mesh: bpy.types.Mesh) -> np.ndarray:
-    """(t, 3, 3) corners of a mesh, in its space."""
+def mesh_triangles(mesh: bpy.types.Mesh) -> np.ndarray:
+    """Read the triangles of a mesh.
+
+    Parameters
+    ----------
+    mesh : bpy.types.Mesh
+        Its `loop_triangles` are in the same order afterwards.
+
+    Returns
+    -------
+    (t, 3, 3) float64 ndarray
+        Corners in the mesh's space.
+    """
     mesh.calc_loop_triangles()
     rows = np.empty(3 * len(mesh.loop_triangles), np.int32)
     mesh.loop_triangles.foreach_get("vertices", rows)
