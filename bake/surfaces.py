@@ -6,6 +6,9 @@ specular layer's energy is kept, its direction is not, as in every irradiance vo
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
+
 import numpy as np
 
 from .snapshot import Channel, Material, Snapshot
@@ -43,6 +46,7 @@ class Surfaces:
         self._fresnel = np.array([average_fresnel(m.ior, m.specular_level) for m in materials], np.float32)
         self._cutoff = np.array([m.alpha_cutoff if m.alpha_mode == "mask" else -1 for m in materials], np.float32)
         self._opaque_alpha = np.array([m.alpha_mode == "opaque" for m in materials], bool)
+        self._transmits = np.array([m.transmission.factor[0] > 0 for m in materials], bool)
         self.transparent = np.array([_lets_light_pass(m) for m in materials], bool)[self.material]
         self.emissive = np.array([max(m.emission.factor) > 0 for m in materials], bool)[self.material]
 
@@ -66,9 +70,9 @@ class Surfaces:
         Source: energy balance of the Principled shader's lobes: metal reflects the base colour; a dielectric
         reflects its average Fresnel term F white, and (1 - F)(1 - transmission) of the base colour.
         """
-        material = self.material[triangle]
-        base, metallic, transmission = self._base_layers(material, triangle, u, v)
-        fresnel = self._fresnel[material]
+        lanes = self._lanes(triangle, u, v)
+        base, metallic, transmission = self._base_layers(lanes)
+        fresnel = self._fresnel[lanes.material]
         diffuse = metallic + (1 - metallic) * (1 - fresnel) * (1 - transmission)
         return np.minimum(base * diffuse + (1 - metallic) * fresnel, 1)
 
@@ -89,11 +93,16 @@ class Surfaces:
         covered : (n,) float32 ndarray
             Alpha: what reflection and emission are multiplied with.
         """
-        material = self.material[triangle]
-        covered = self._coverage(material, triangle, u, v)
-        base, metallic, transmission = self._base_layers(material, triangle, u, v)
-        clear = covered * (1 - metallic) * (1 - self._fresnel[material]) * transmission
-        return np.minimum(1 - covered + clear * base, 1), covered
+        lanes = self._lanes(triangle, u, v)
+        covered = self._coverage(lanes)
+        passed = np.repeat((1 - covered)[None], 3, axis=0)
+        rows = np.flatnonzero(self._transmits[lanes.material])
+        if len(rows):
+            clear = self._lanes(triangle[rows], u[rows], v[rows])
+            base, metallic, transmission = self._base_layers(clear)
+            share = covered[rows] * (1 - metallic) * (1 - self._fresnel[clear.material]) * transmission
+            passed[:, rows] += share * base
+        return np.minimum(passed, 1), covered
 
     def emission(self, triangle: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Radiance that surfaces emit, on both sides.
@@ -110,39 +119,65 @@ class Surfaces:
         (3, n) float32 ndarray
             Radiance [W/(m2 sr)].
         """
-        material = self.material[triangle]
-        return self._evaluate("emission", material, triangle, u, v)
+        return self._evaluate("emission", self._lanes(triangle, u, v))
 
-    def _base_layers(self, material, triangle, u, v) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _lanes(self, triangle: np.ndarray, u: np.ndarray, v: np.ndarray) -> _Lanes:
+        """Hits, with what their channels share."""
+        return _Lanes(self.material[triangle], triangle, u, v, self._uvs, self._colors)
+
+    def _base_layers(self, lanes: _Lanes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Base colour, metallic, transmission."""
-        base = np.minimum(self._evaluate("base_color", material, triangle, u, v), 1)
-        metallic = np.minimum(self._evaluate("metallic", material, triangle, u, v)[0], 1)
-        transmission = np.minimum(self._evaluate("transmission", material, triangle, u, v)[0], 1)
+        base = np.minimum(self._evaluate("base_color", lanes), 1)
+        metallic = np.minimum(self._evaluate("metallic", lanes)[0], 1)
+        transmission = np.minimum(self._evaluate("transmission", lanes)[0], 1)
         return base, metallic, transmission
 
-    def _coverage(self, material, triangle, u, v) -> np.ndarray:
+    def _coverage(self, lanes: _Lanes) -> np.ndarray:
         """Alpha after the material's mode: opaque, cut, or as it is."""
-        alpha = np.minimum(self._evaluate("alpha", material, triangle, u, v)[0], 1)
-        cutoff = self._cutoff[material]
+        alpha = np.minimum(self._evaluate("alpha", lanes)[0], 1)
+        cutoff = self._cutoff[lanes.material]
         alpha = np.where(cutoff >= 0, (alpha >= cutoff).astype(np.float32), alpha)
-        return np.where(self._opaque_alpha[material], np.float32(1), alpha)
+        return np.where(self._opaque_alpha[lanes.material], np.float32(1), alpha)
 
-    def _evaluate(self, name: str, material, triangle, u, v) -> np.ndarray:
+    def _evaluate(self, name: str, lanes: _Lanes) -> np.ndarray:
         """(k, n) values of one channel; float images and vertex colours may hold negative ones, light may not."""
         table = self._channel[name]
-        value = table.factor[:, material]
+        value = table.factor[:, lanes.material]
         if table.has_texture:
-            lanes = np.flatnonzero(table.texture[material] >= 0)
-            if len(lanes):
-                uv = _interpolate(self._uvs, triangle[lanes], u[lanes], v[lanes])
-                value[:, lanes] *= table.sample(material[lanes], uv)
+            rows = np.flatnonzero(table.texture[lanes.material] >= 0)
+            if len(rows) == len(lanes.material):
+                value *= table.sample(lanes.material, lanes.uv)
+            elif len(rows):
+                value[:, rows] *= table.sample(lanes.material[rows], lanes.uv[:, rows])
         if table.has_color:
-            lanes = np.flatnonzero(table.color[material])
-            rgba = _interpolate(self._colors, triangle[lanes], u[lanes], v[lanes])
-            value[:, lanes] *= rgba[:3] if len(value) == 3 else rgba[3:]
+            rows = np.flatnonzero(table.color[lanes.material])
+            rgba = lanes.color[:, rows]
+            value[:, rows] *= rgba[:3] if len(value) == 3 else rgba[3:]
         if table.has_texture or table.has_color:
             np.maximum(value, 0, out=value)
         return value
+
+
+@dataclass
+class _Lanes:
+    """Hits, and their attributes, interpolated when the first channel asks and kept for the others."""
+
+    material: np.ndarray
+    triangle: np.ndarray
+    u: np.ndarray
+    v: np.ndarray
+    uvs: np.ndarray
+    colors: np.ndarray
+
+    @cached_property
+    def uv(self) -> np.ndarray:
+        """(2, n) texture coordinates."""
+        return _interpolate(self.uvs, self.triangle, self.u, self.v)
+
+    @cached_property
+    def color(self) -> np.ndarray:
+        """(4, n) vertex colours."""
+        return _interpolate(self.colors, self.triangle, self.u, self.v)
 
 
 class _ChannelTable:

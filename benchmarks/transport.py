@@ -3,8 +3,9 @@
     python benchmarks/transport.py SNAPSHOT.giv [--points 1024] [--samples 256] [--bounces 4] [--repeat 5]
 
 Gathers light at data points of a scene, records every batch of rays that a run traces, and replays the batches
-through embreex with nothing between. Prints rays per second of both and their ratio, the medians of several
-alternating runs after one to warm up, and adds a row to `benchmarks/results.csv`.
+through embreex with nothing between. Prints rays per second of processor time of both, on one thread, and their
+ratio: medians of several alternating runs after one to warm up. The speed-up of two threads is of wall time. A scene
+without a sky or a sun gets one. Adds rows to `benchmarks/results.csv`.
 """
 
 from __future__ import annotations
@@ -20,8 +21,9 @@ import numpy as np
 from gi_volumes.bake import datapoints, snapshot_file
 from gi_volumes.bake.gather import Effort, gather
 from gi_volumes.bake.rays import Tracer
-from gi_volumes.bake.scene import Model, prepare, scene_suns
+from gi_volumes.bake.scene import prepare, scene_suns
 from gi_volumes.bake.sensors import DataPoints
+from gi_volumes.bake.settings import Settings, model
 from results import add_row
 
 
@@ -43,34 +45,37 @@ class Recorder(Tracer):
 
 def replay(batches: list[tuple]) -> float:
     """Seconds that embreex alone takes for recorded batches."""
-    start = time.perf_counter()
+    start = time.process_time()
     for scene, origin, direction, far, first_hit in batches:
         limit = None if far is None else far.astype(np.float32)
         if first_hit:
             scene.run(origin.T, direction.T, limit, output=True)
         else:
             scene.run(origin.T, direction.T, limit, query="OCCLUDED")
-    return time.perf_counter() - start
+    return time.process_time() - start
 
 
 def main() -> None:
     """Measure one scene."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("snapshot", type=Path)
+    parser.add_argument("--name", help="of the scene, for the results")
     parser.add_argument("--points", type=int, default=1024)
     parser.add_argument("--samples", type=int, default=256)
     parser.add_argument("--bounces", type=int, default=4)
     parser.add_argument("--repeat", type=int, default=5)
     options = parser.parse_args()
     snapshot = snapshot_file.load(options.snapshot)
-    scene = prepare(snapshot, Model(True, scene_suns(snapshot), "fixed"))
+    sky = "scene" if snapshot.sky.any() else "1.0"
+    sun = "scene" if len(scene_suns(snapshot).toward) else "0.2,0.3,1"
+    scene = prepare(*model(snapshot, Settings(sky=sky, sun=sun)))
     position, keys = data_points(scene, options.points)
     effort = Effort(options.samples, options.bounces, threads=1)
 
     def run(tracing_scene) -> float:
-        start = time.perf_counter()
+        start = time.process_time()
         gather(tracing_scene, DataPoints(), position, keys, effort)
-        return time.perf_counter() - start
+        return time.process_time() - start
 
     recorder = Recorder(scene.tracer)
     run(type(scene)(**{**scene.__dict__, "tracer": recorder}))
@@ -78,22 +83,22 @@ def main() -> None:
     replay(recorder.batches)
     pairs = [(run(scene), replay(recorder.batches)) for _ in range(options.repeat)]
     whole, alone = np.median(pairs, axis=0)
-    two = float(np.median([run_threads(scene, position, keys, options) for _ in range(options.repeat)]))
+    wall = [[run_threads(scene, position, keys, options, n) for n in (1, 2)] for _ in range(options.repeat)]
     figures = {
         "rays": rays,
         "mrays_per_s": rays / whole / 1e6,
         "embree_mrays_per_s": rays / alone / 1e6,
         "ratio": float(np.median([b / a for a, b in pairs])),
         "us_per_path": whole / position.shape[1] / options.samples * 1e6,
-        "two_threads_speedup": whole / two,
+        "two_threads_speedup": float(np.median([one / two for one, two in wall])),
     }
-    add_row("transport", options.snapshot.stem, figures)
+    add_row("transport", options.name or options.snapshot.stem, figures)
 
 
-def run_threads(scene, position, keys, options) -> float:
-    """Seconds of the same work on two threads."""
+def run_threads(scene, position, keys, options, threads: int) -> float:
+    """Seconds that pass while some threads do the work."""
     start = time.perf_counter()
-    gather(scene, DataPoints(), position, keys, Effort(options.samples, options.bounces, threads=2))
+    gather(scene, DataPoints(), position, keys, Effort(options.samples, options.bounces, threads=threads))
     return time.perf_counter() - start
 
 
