@@ -2,7 +2,7 @@
 
     python benchmarks/cycles_agreement.py SCENE [--points N] [--samples S] [--paths P] [--bounces B]
                                           [--transports sky,sun,local] [--materials diffuse|original]
-                                          [--keep-coincident] [--worst K]
+                                          [--keep-coincident] [--bright] [--worst K]
 
 Comes in: a .blend, .glb or .gltf file; what lacks a sky or a sun gets one. Goes out: a line for each transport, and
 a row of agreement.csv. With diffuse materials Cycles models what we model, so that the difference has to be noise;
@@ -29,9 +29,16 @@ SKY_RADIANCE, SUN_IRRADIANCE = 1.0, 4.0
 SUN_TILT = (math.radians(38), 0.0, math.radians(-35))
 """Turns a sun that shines down: high enough to reach into courts and windows."""
 FIRST_SEED, SEEDS = 1, 2
+PILOT_PATHS, PILOT_SEED = 32, 99
+PILOT_CANDIDATES = 4
+"""Points to choose the bright ones from, for each one that is wanted."""
 
-Estimator = Callable[[str], np.ndarray]
-"""From a transport to runs of irradiance, (k, n, 3) [W/m2]."""
+PILOT_FLOOR = 0.05
+"""Chance of dark points, over that of a point of mean brightness, so that nothing is left out."""
+
+
+Estimator = Callable[[np.ndarray, np.ndarray, str, tuple[int, ...]], np.ndarray]
+"""From points, normals, a transport and k seeds to k runs of irradiance, (k, n, 3) [W/m2]."""
 
 
 @dataclass(frozen=True)
@@ -165,13 +172,11 @@ def open_scene(path: Path) -> list[str]:
     return added
 
 
-def our_estimator(points: np.ndarray, normals: np.ndarray, paths: int, bounces: int) -> Estimator:
+def our_estimator(paths: int, bounces: int) -> Estimator:
     """Prepare our reference on the open scene.
 
     Parameters
     ----------
-    points, normals : (n, 3) float64 ndarray
-        World space [m], unit length.
     paths, bounces : int
         Paths for each point in one run, and reflections.
 
@@ -186,9 +191,8 @@ def our_estimator(points: np.ndarray, normals: np.ndarray, paths: int, bounces: 
     snapshot = extract.extract(bpy.context)
     suns = snapshot.lights.strength[snapshot.lights.kind == reference.LightKind.SUN]
 
-    def estimate(transport: str) -> np.ndarray:
+    def estimate(points: np.ndarray, normals: np.ndarray, transport: str, seeds: tuple[int, ...]) -> np.ndarray:
         scale = suns[0] if transport == "sun" else 1.0
-        seeds = range(FIRST_SEED, FIRST_SEED + SEEDS)
         runs = [
             reference.irradiance(snapshot, points, normals, transport, samples=paths, bounces=bounces, seed=seed)
             for seed in seeds
@@ -198,25 +202,47 @@ def our_estimator(points: np.ndarray, normals: np.ndarray, paths: int, bounces: 
     return estimate
 
 
-def cycles_estimator(points: np.ndarray, normals: np.ndarray, samples: int, bounces: int, first_seed: int) -> Estimator:
+def cycles_estimator(samples: int, bounces: int) -> Estimator:
     """Prepare the judge on the open scene.
 
     Parameters
     ----------
-    points, normals : (n, 3) float64 ndarray
-        World space [m], unit length.
     samples, bounces : int
         As in `cycles_judge.Settings`.
-    first_seed : int
-        Runs have this seed and the ones after it.
 
     Returns
     -------
     Estimator
     """
-    seeds = tuple(range(first_seed, first_seed + SEEDS))
-    settings = cycles_judge.Settings(samples=samples, bounces=bounces, seeds=seeds)
-    return lambda transport: cycles_judge.irradiance(points, normals, transport, settings).runs
+
+    def estimate(points: np.ndarray, normals: np.ndarray, transport: str, seeds: tuple[int, ...]) -> np.ndarray:
+        settings = cycles_judge.Settings(samples=samples, bounces=bounces, seeds=seeds)
+        return cycles_judge.irradiance(points, normals, transport, settings).runs
+
+    return estimate
+
+
+def bright(points: np.ndarray, pilot: np.ndarray, count: int, seed: int) -> np.ndarray:
+    """Choose points by how much light arrives, so that few samples are spent on darkness.
+
+    Parameters
+    ----------
+    points : (n, 3) ndarray
+        To choose from.
+    pilot : (n,) ndarray
+        Rough irradiance there, from numbers that nothing else uses.
+    count : int
+        How many, at most n.
+    seed : int
+        Of the choice.
+
+    Returns
+    -------
+    (count,) int64 ndarray
+        Rows.
+    """
+    chance = pilot + max(PILOT_FLOOR * pilot.mean(), 1e-30)
+    return np.random.default_rng(seed).choice(len(points), count, replace=False, p=chance / chance.sum())
 
 
 def main() -> None:
@@ -227,23 +253,39 @@ def main() -> None:
     if not options.keep_coincident:
         removed, left = coincident_faces.remove_coincident()
         print(f"removed {removed} faces that lie in others; {100 * left:.2f} % of the area still lies in others")
-    points, normals = surface_points.pick(surface_points.world_triangles(), options.points, options.seed)
-    if options.against == "ours":
-        ours = our_estimator(points, normals, options.paths, options.bounces)
-    else:
-        ours = cycles_estimator(points, normals, options.samples, options.bounces, FIRST_SEED + SEEDS)
-    judge = cycles_estimator(points, normals, options.samples, options.bounces, FIRST_SEED)
+    triangles = surface_points.world_triangles()
+    candidates = surface_points.pick(
+        triangles, options.points * (PILOT_CANDIDATES if options.bright else 1), options.seed
+    )
+    # Ours read the scene before the judge's edits.
+    pilot, ours = our_estimator(PILOT_PATHS, options.bounces), our_estimator(options.paths, options.bounces)
+    judge = cycles_estimator(options.samples, options.bounces)
     if options.materials == "diffuse":
         scene_edits.make_diffuse()
     for transport in options.transports.split(","):
-        runs = ours(transport), judge(transport)
-        result = agreement(*runs)
+        points, normals = _brightest(candidates, pilot, transport, options) if options.bright else candidates
+        seeds, others = (tuple(range(first, first + SEEDS)) for first in (FIRST_SEED, FIRST_SEED + SEEDS))
+        mine = (ours if options.against == "ours" else judge)(points, normals, transport, others)
+        judged = judge(points, normals, transport, seeds)
+        result = agreement(mine, judged)
         print(_line(transport, result), flush=True)
-        for row in worst(*runs, options.worst):
-            estimates = "   ".join(f"{part[:, row].mean():.5f} (runs {part[:, row].mean(axis=1)})" for part in runs)
-            print(f"    at {points[row].round(3)} facing {normals[row].round(3)}: {estimates}")
+        _print_worst(points, normals, mine, judged, options.worst)
         if options.record:
             _append(options, transport, result)
+
+
+def _brightest(candidates: tuple[np.ndarray, np.ndarray], pilot: Estimator, transport: str, options) -> tuple:
+    """Points and normals that the light of a transport reaches."""
+    light = pilot(*candidates, transport, (PILOT_SEED,))[0].mean(axis=1)
+    rows = bright(candidates[0], light, options.points, options.seed)
+    return candidates[0][rows], candidates[1][rows]
+
+
+def _print_worst(points: np.ndarray, normals: np.ndarray, ours: np.ndarray, judge: np.ndarray, count: int) -> None:
+    """Where to look for the cause of a difference."""
+    for row in worst(ours, judge, count):
+        mine, theirs = (f"{part[:, row].mean():.5f} {part[:, row].mean(axis=1).round(5)}" for part in (ours, judge))
+        print(f"    at {points[row].round(3)} facing {normals[row].round(3)}: ours {mine}, Cycles {theirs}")
 
 
 def _parse() -> argparse.Namespace:
@@ -261,6 +303,7 @@ def _parse() -> argparse.Namespace:
         "--against", choices=("ours", "cycles"), default="ours", help="cycles: the judge against itself"
     )
     parser.add_argument("--keep-coincident", action="store_true", help="faces that lie in others stay in the scene")
+    parser.add_argument("--bright", action="store_true", help="choose points by how much light arrives")
     parser.add_argument("--worst", type=int, default=0, help="print so many points that are furthest apart")
     parser.add_argument("--no-record", dest="record", action="store_false", help="leave agreement.csv alone")
     return parser.parse_args()
@@ -277,7 +320,7 @@ def _line(transport: str, result: Agreement) -> str:
 
 def _append(options: argparse.Namespace, transport: str, result: Agreement) -> None:
     """Add a row to the results, under a header if it is the first."""
-    names = ("points", "samples", "paths", "bounces", "seed", "materials", "against", "keep_coincident")
+    names = ("points", "samples", "paths", "bounces", "seed", "materials", "against", "keep_coincident", "bright")
     row = {"commit": _commit(), "blender": bpy.app.version_string, "scene": options.scene.name, "transport": transport}
     row |= {name: getattr(options, name) for name in names}
     row |= {name: f"{value:.6g}" for name, value in asdict(result).items()}

@@ -156,15 +156,20 @@ def make_diffuse() -> None:
 
     Reflection becomes diffuse: the base colour, under a dielectric's layer that reflects its average Fresnel term
     in white; transmission goes straight through, tinted by the base colour; emission and alpha stay. Normal maps,
-    coat, sheen and subsurface scattering are gone.
+    smooth normals, coat, sheen and subsurface scattering are gone.
     """
+    for item in bpy.data.objects:
+        # Moves the shadow rays of smooth faces.
+        item.shadow_terminator_geometry_offset = 0.0
     for tree in material_trees():
         for node in list(tree.nodes):
             if node.bl_idname == "ShaderNodeBsdfPrincipled":
                 _replace(tree, node, _principled_as_diffuse(tree, node))
             elif node.bl_idname in DIFFUSE_SHADERS:
                 colour = next(s for s in node.inputs if s.type == "RGBA")
-                _replace(tree, node, _shader(tree, "ShaderNodeBsdfDiffuse", Color=colour))
+                _replace(tree, node, _diffuse(tree, colour))
+            elif node.bl_idname == "ShaderNodeBsdfDiffuse":
+                _replace(tree, node, _diffuse(tree, node.inputs["Color"]))
             elif node.bl_idname in TRANSPARENT_SHADERS:
                 _replace(tree, node, _shader(tree, "ShaderNodeBsdfTransparent", Color=node.inputs["Color"]))
 
@@ -202,14 +207,12 @@ def _principled_as_diffuse(tree: bpy.types.NodeTree, node: bpy.types.Node) -> bp
     """Nodes of a diffuse surface with the emission, transmission and alpha of a Principled shader."""
     inputs = node.inputs
     colour = inputs["Base Color"]
-    surface = base = _shader(tree, "ShaderNodeBsdfDiffuse", Color=colour)
+    surface = base = _diffuse(tree, colour)
     if _varies(inputs["Transmission Weight"], 0.0):
         straight = _shader(tree, "ShaderNodeBsdfTransparent", Color=colour)
         surface = _mix(tree, inputs["Transmission Weight"], surface, straight)
-    layer = tree.nodes.new("ShaderNodeBsdfDiffuse")
-    layer.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
     fresnel = average_fresnel(inputs["IOR"].default_value, inputs["Specular IOR Level"].default_value)
-    surface = _mix(tree, fresnel, surface, layer.outputs[0])
+    surface = _mix(tree, fresnel, surface, _diffuse(tree))
     if _varies(inputs["Metallic"], 0.0):
         surface = _mix(tree, inputs["Metallic"], surface, base)
     if _varies(inputs["Emission Strength"], 0.0):
@@ -226,6 +229,16 @@ def _principled_as_diffuse(tree: bpy.types.NodeTree, node: bpy.types.Node) -> bp
     if _varies(inputs["Alpha"], 1.0):
         surface = _mix(tree, inputs["Alpha"], _shader(tree, "ShaderNodeBsdfTransparent"), surface)
     return surface
+
+
+def _diffuse(tree: bpy.types.NodeTree, colour: bpy.types.NodeSocket | None = None) -> bpy.types.NodeSocket:
+    """Output of a new diffuse surface with the normals of its triangles, white unless a colour is given."""
+    shader, geometry = tree.nodes.new("ShaderNodeBsdfDiffuse"), tree.nodes.new("ShaderNodeNewGeometry")
+    shader.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
+    if colour is not None:
+        _feed(tree, colour, shader.inputs["Color"])
+    tree.links.new(geometry.outputs["True Normal"], shader.inputs["Normal"])
+    return shader.outputs[0]
 
 
 def _varies(socket: bpy.types.NodeSocket, default: float) -> bool:
