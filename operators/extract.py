@@ -6,9 +6,11 @@ and visibility with their render settings, whatever the viewport shows. The scen
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import bpy
+import numpy as np
 
 from ..bake.snapshot import Snapshot, SnapshotError
 from . import cameras, render_depsgraph, scene_file, sky
@@ -21,6 +23,7 @@ from .node_values import VALUES
 from .notes import Notes
 from .placement import Placements
 
+REC709 = "Linear Rec.709"
 # What renders but has no surface made of triangles.
 WITHOUT_MESH = {
     "CURVES": "hair curves",
@@ -37,8 +40,7 @@ def extract(context_or_depsgraph: bpy.types.Context | bpy.types.Depsgraph) -> Sn
     Parameters
     ----------
     context_or_depsgraph : bpy.types.Context or bpy.types.Depsgraph
-        Names the scene and the view layer. The viewport's graph stands for the same scene as it renders; a
-        render engine's graph is read as it is.
+        Names the scene and the view layer; whatever a graph was made for, what renders is read.
 
     Returns
     -------
@@ -51,15 +53,15 @@ def extract(context_or_depsgraph: bpy.types.Context | bpy.types.Depsgraph) -> Sn
         There is nothing to bake, or it holds invalid numbers; the message names the object and the remedy.
     """
     if isinstance(context_or_depsgraph, bpy.types.Depsgraph):
-        depsgraph = context_or_depsgraph
-        if depsgraph.mode == "RENDER":
-            return _read(depsgraph, depsgraph.scene.original, cameras.picture_size(depsgraph.scene))
-        scene, view_layer = depsgraph.scene.original, depsgraph.view_layer.original
+        scene, view_layer = context_or_depsgraph.scene.original, context_or_depsgraph.view_layer.original
     else:
         scene, view_layer = context_or_depsgraph.scene, context_or_depsgraph.view_layer
-    size = cameras.picture_size(scene)
+    notes = Notes()
     with scene_file.quiet():
-        return render_depsgraph.read(scene, view_layer, lambda depsgraph: _read(depsgraph, scene, size))
+        snapshot = render_depsgraph.read(scene, view_layer, lambda depsgraph: _read(depsgraph, scene, notes))
+        panorama = sky.read(scene, notes)
+    _note_colors(notes)
+    return replace(snapshot, sky=panorama, notes=notes.record())
 
 
 def from_file(path: Path | str) -> Snapshot:
@@ -85,9 +87,8 @@ def from_file(path: Path | str) -> Snapshot:
         return extract(bpy.context)
 
 
-def _read(depsgraph: bpy.types.Depsgraph, scene: bpy.types.Scene, size: tuple[int, int]) -> Snapshot:
-    """Read an evaluated scene."""
-    notes = Notes()
+def _read(depsgraph: bpy.types.Depsgraph, scene: bpy.types.Scene, notes: Notes) -> Snapshot:
+    """Everything but the sky, which Blender cannot render at the same time."""
     images = Images(notes)
     evaluator = Evaluator(images, notes, VALUES)
     meshes, lamps = Meshes(notes, Materials(evaluator)), Lamps(notes, evaluator)
@@ -100,9 +101,8 @@ def _read(depsgraph: bpy.types.Depsgraph, scene: bpy.types.Scene, size: tuple[in
         materials=tuple(meshes.materials.records),
         images=tuple(images.records),
         lights=lamps.record(),
-        sky=sky.read(depsgraph.scene.world, evaluator),
-        cameras=cameras.read(depsgraph, scene.camera, size, notes),
-        notes=notes.record(),
+        sky=np.zeros((1, 1, 3), np.float32),
+        cameras=cameras.read(depsgraph, scene.camera, cameras.picture_size(scene), notes),
         source=bpy.data.filepath,
     )
 
@@ -141,3 +141,10 @@ def _nothing(scene: bpy.types.Scene, lamps: Lamps) -> str:
         f"scene '{scene.name}' has {found} mesh that renders: add one, or enable its render visibility "
         "(camera icon in the outliner)"
     )
+
+
+def _note_colors(notes: Notes) -> None:
+    """From Blender 5 on a file may mix colours in another space than ours."""
+    space = getattr(getattr(bpy.data, "colorspace", None), "working_space", REC709)
+    if space != REC709:
+        notes.add(f"working space '{space}'", "its numbers as Linear Rec.709", "all colours")

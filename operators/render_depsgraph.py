@@ -59,7 +59,7 @@ def read(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, reader: Callab
     bpy.utils.register_class(Reader)
     try:
         with _copy(scene, view_layer) as copy:
-            _render(copy)
+            render(copy)
     finally:
         bpy.utils.unregister_class(Reader)
     if "error" in outcome:
@@ -71,16 +71,45 @@ def read(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, reader: Callab
     return outcome["value"]
 
 
-@contextmanager
-def temporary_result() -> Iterator[None]:
-    """Remove the image of render results afterwards, unless there was one before."""
+def render(scene: bpy.types.Scene, write: bool = False) -> None:
+    """Render a temporary scene on this thread, unseen by handlers and leaving no render result behind.
+
+    Parameters
+    ----------
+    scene : bpy.types.Scene
+        A temporary scene.
+    write : bool
+        Whether to write its picture to its file.
+
+    Raises
+    ------
+    SnapshotError
+        Blender refused, for example because a render is running.
+    """
     before = RENDER_RESULT in bpy.data.images
+    with _without_handlers():
+        try:
+            bpy.ops.render.render(scene=scene.name, write_still=write)
+        except RuntimeError as error:
+            raise SnapshotError(f"the scene could not be evaluated: {str(error).strip()}") from error
+        finally:
+            image = bpy.data.images.get(RENDER_RESULT)
+            if image is not None and not before:
+                bpy.data.images.remove(image)
+
+
+@contextmanager
+def _without_handlers() -> Iterator[None]:
+    """Keep scripts that wait for the user's renders from hearing of this one."""
+    lists = [getattr(bpy.app.handlers, name) for name in dir(bpy.app.handlers) if name.startswith("render_")]
+    kept = [list(handlers) for handlers in lists]
+    for handlers in lists:
+        handlers.clear()
     try:
         yield
     finally:
-        image = bpy.data.images.get(RENDER_RESULT)
-        if image is not None and not before:
-            bpy.data.images.remove(image)
+        for handlers, functions in zip(lists, kept, strict=True):
+            handlers.extend(functions)
 
 
 @contextmanager
@@ -93,12 +122,12 @@ def _copy(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer) -> Iterator[b
         _keep_only(copy, name)
         if copy.camera is None:
             copy.camera = bpy.data.objects.new("GI Volumes", camera)
-        render = copy.render
-        render.engine = ENGINE
-        render.resolution_x = render.resolution_y = PICTURE_PX
-        render.resolution_percentage = 100
-        render.use_compositing = render.use_sequencer = render.use_multiview = False
-        render.use_border = False
+        settings = copy.render
+        settings.engine = ENGINE
+        settings.resolution_x = settings.resolution_y = PICTURE_PX
+        settings.resolution_percentage = 100
+        settings.use_compositing = settings.use_sequencer = settings.use_multiview = False
+        settings.use_border = False
         yield copy
     finally:
         bpy.data.scenes.remove(copy)
@@ -110,12 +139,3 @@ def _keep_only(scene: bpy.types.Scene, name: str) -> None:
     for layer in [layer for layer in scene.view_layers if layer.name != name]:
         scene.view_layers.remove(layer)
     scene.view_layers[name].use = True
-
-
-def _render(scene: bpy.types.Scene) -> None:
-    """Render on this thread, without handlers' or the user's scene's knowledge."""
-    with temporary_result():
-        try:
-            bpy.ops.render.render(scene=scene.name)
-        except RuntimeError as error:
-            raise SnapshotError(f"scene '{scene.name}' could not be evaluated: {str(error).strip()}") from error
