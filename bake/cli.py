@@ -15,6 +15,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import TextIO
 
 from ..tree import container, verify, world
 from . import job, reference, snapshot_file
@@ -57,8 +58,11 @@ def main(argv: list[str], extract: Extract) -> int:
     try:
         return _run(options, extract)
     except BrokenPipeError:
-        _close_outputs()
+        _drop(sys.stdout)
+        _drop(sys.stderr)
         return 1
+    finally:
+        _flush_or_drop(sys.stdout)
 
 
 def _run(options, extract: Extract) -> int:
@@ -89,11 +93,19 @@ def _print_result(options, result: dict) -> None:
         print(text.encode(encoding, "backslashreplace").decode(encoding), flush=True)
 
 
-def _close_outputs() -> None:
-    """Nobody reads any more: let Python end without complaining about it."""
+def _drop(stream: TextIO) -> None:
+    """Write to nowhere from now on, so that Python can end without complaining about what nobody took."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
-    for stream in (sys.stdout, sys.stderr):
-        os.dup2(nowhere, stream.fileno())
+    os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)
+
+
+def _flush_or_drop(stream: TextIO) -> None:
+    """A failure to write has been reported; it must not be met again when Python ends."""
+    try:
+        stream.flush()
+    except OSError:
+        _drop(stream)
 
 
 def _joined(argv: list[str]) -> list[str]:

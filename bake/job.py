@@ -107,7 +107,7 @@ def bake(
         _bake_cells(scene, grid, trees, place, settings, threads, progress)
         place.take()
     finally:
-        listed = folder.assemble(target, header)["cells"] if place.taken else []
+        listed = place.close()
     if len(listed) < len(occupied):
         outcome.warnings.append(f"{len(occupied) - len(listed)} of the scene's {len(occupied)} cells are not baked yet")
     outcome.seconds = progress.seconds

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import json
+import shutil
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -109,10 +111,11 @@ class Place:
     def __init__(self, target: Path, snapshot: Snapshot, header: dict) -> None:
         self.target, self.identity, self.taken = target, header["bake"], False
         self._snapshot, self._header = snapshot, header
+        self._staging: list[Path] = []
         is_new = not target.exists()
         target.mkdir(parents=True, exist_ok=True)
         try:
-            _check_writable(target)
+            self._check_writable()
             if _bake_in(target) in (None, self.identity):
                 self.take()
         except OSError:
@@ -131,15 +134,30 @@ class Place:
         """
         if self.taken:
             return
-        is_ours = _bake_in(self.target) == self.identity
-        with tempfile.TemporaryDirectory(prefix=STAGING, dir=self.target) as staging:
-            scene = Path(staging) / SNAPSHOT_NAME
-            snapshot_file.save(self._snapshot, scene)
-            folder.assemble(self.target, self._header)
+        with self._stage() as staging:
+            snapshot_file.save(self._snapshot, staging / SNAPSHOT_NAME)
+            content = folder.assemble(self.target, self._header)
             self.taken = True
-            scene.replace(self.target / SNAPSHOT_NAME)
-        if not is_ours:
-            _remove_other_bakes(self.target, self.identity)
+            (staging / SNAPSHOT_NAME).replace(self.target / SNAPSHOT_NAME)
+        listed = {file["name"] for entry in content["cells"] for file in entry["files"].values()}
+        _remove_other_bakes(self.target, self.identity, listed)
+
+    def close(self) -> list[dict]:
+        """List the cells that are there, and leave nothing else.
+
+        Returns
+        -------
+        list of dict
+            Entries of the cells in `world.json`; empty while the folder holds another bake.
+
+        Raises
+        ------
+        OSError
+            The list cannot be written.
+        """
+        for staging in self._staging:
+            shutil.rmtree(staging, ignore_errors=True)
+        return folder.assemble(self.target, self._header)["cells"] if self.taken else []
 
     def write_cell(self, tree: Topology, payloads: dict, valid: np.ndarray, offset: np.ndarray) -> None:
         """Put all files of a cell into the folder, or none; the tree, which makes a cell count, comes last.
@@ -160,20 +178,29 @@ class Place:
         OSError
             A file cannot be written.
         """
-        with tempfile.TemporaryDirectory(prefix=STAGING, dir=self.target) as staging:
+        with self._stage() as staging:
             folder.write_cell(staging, tree, payloads, valid, offset, {"bake": self.identity})
             self.take()
-            for path in sorted(Path(staging).iterdir(), key=lambda path: path.suffix == ".tree"):
+            for path in sorted(staging.iterdir(), key=lambda path: path.suffix == ".tree"):
                 path.replace(self.target / path.name)
 
+    @contextlib.contextmanager
+    def _stage(self) -> Iterator[Path]:
+        """A folder for files that nobody may see yet; `close` removes what an interruption leaves of it."""
+        staging = Path(tempfile.mkdtemp(prefix=STAGING, dir=self.target))
+        self._staging.append(staging)
+        try:
+            yield staging
+        finally:
+            shutil.rmtree(staging, ignore_errors=True)
 
-def _check_writable(target: Path) -> None:
-    """Refuse a folder that nothing can be put into, before hours of work."""
-    try:
-        with tempfile.TemporaryDirectory(prefix=STAGING, dir=target):
-            pass
-    except OSError as error:
-        raise OSError(error.errno, f"cannot write: {error.strerror}", str(target)) from None
+    def _check_writable(self) -> None:
+        """Refuse a folder that nothing can be put into, before hours of work."""
+        try:
+            with self._stage():
+                pass
+        except OSError as error:
+            raise OSError(error.errno, f"cannot write: {error.strerror}", str(self.target)) from None
 
 
 def _bake_in(target: Path) -> str | None:
@@ -184,10 +211,10 @@ def _bake_in(target: Path) -> str | None:
         return None
 
 
-def _remove_other_bakes(target: Path, identity: str) -> None:
-    """Remove the files of cells that this bake did not write."""
+def _remove_other_bakes(target: Path, identity: str, listed: set[str]) -> None:
+    """Remove the files of cells that this bake did not write; only those that it does not list are read."""
     for path in folder.files(target):
-        if path.name.startswith("cell_") and not _belongs(path, identity):
+        if path.name.startswith("cell_") and path.name not in listed and not _belongs(path, identity):
             path.unlink(missing_ok=True)
 
 

@@ -5,6 +5,7 @@ Comes in: stages and how much of them is done. Goes out: a line now and then, wi
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sys
 import time
@@ -106,7 +107,8 @@ class Progress:
         """
         self._end_line()
         if self._as_json:
-            print(json.dumps({"error": message}), flush=True)
+            with contextlib.suppress(OSError):
+                print(json.dumps({"error": message}), flush=True)
         print(f"error: {message}", file=sys.stderr, flush=True)
 
     def interrupt(self) -> None:

@@ -6,6 +6,7 @@ import dataclasses
 import errno
 import json
 import os
+import shutil
 import signal
 import stat
 import subprocess
@@ -16,6 +17,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import QUICK, Points, call, cells_only, content, ground_points, stored, succeed, yard
+from gi_volumes.bake import job
+from gi_volumes.bake.settings import Settings, SettingsError
 from gi_volumes.tree import container
 from statistics_checks import standard_error
 
@@ -159,7 +162,7 @@ def start(*words: object) -> subprocess.Popen:
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-SLOW = ("--samples", "2048", "--finest", "2", "--threads", "1")
+SLOW = ("--samples", "4096", "--finest", "2", "--threads", "1")
 
 
 @pytest.fixture(scope="module")
@@ -246,6 +249,34 @@ def test_some_cells_of_another_bake_are_not_kept_beside_some_of_this_one(row, tm
     assert {name.split(".")[0] for name in cells_only(tmp_path)} == {"cell_1_0"}
 
 
+def test_an_interruption_while_the_other_bake_s_files_go_does_not_keep_them(row, tmp_path, monkeypatch):
+    succeed("bake", row, "-o", tmp_path, *QUICK)
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            call("bake", row, "-o", tmp_path, *QUICK, "--seed", "1", "--cells", "1,0")
+    succeed("bake", row, "-o", tmp_path, *QUICK, "--seed", "1", "--cells", "1,0")
+    assert {name.split(".")[0] for name in cells_only(tmp_path)} == {"cell_1_0"}
+
+
+def test_an_interruption_while_files_are_put_away_leaves_none_of_them(row, tmp_path, monkeypatch):
+    remove = shutil.rmtree
+    calls = []
+
+    def interrupted(path, **options):
+        calls.append(path)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        remove(path, **options)
+
+    monkeypatch.setattr(shutil, "rmtree", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        call("bake", row, "-o", tmp_path, *QUICK)
+    assert len(calls) > 3
+    assert listed(tmp_path) == [[0, 0]]
+    assert not [path for path in tmp_path.iterdir() if path.is_dir()]
+
+
 def test_the_files_of_another_bake_go_also_when_its_list_is_lost(row, tmp_path):
     succeed("bake", row, "-o", tmp_path, *QUICK)
     (tmp_path / "world.json").write_bytes(b"{damaged")
@@ -325,3 +356,36 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_light_is_gathered
     monkeypatch.undo()
     assert said.reason == f"{target}: " + "cannot write: " * occupied + "Permission denied"
     assert content(target) == before
+
+
+@pytest.mark.parametrize("moved", range(6))
+def test_a_cell_counts_only_when_all_of_its_files_are_there(row, row_baked, tmp_path, monkeypatch, moved):
+    target, left = tmp_path / "out", [1 + moved]
+    replace = Path.replace
+
+    def stop(path: Path, goal: Path) -> Path:
+        if not left[0]:
+            raise KeyboardInterrupt
+        left[0] -= 1
+        return replace(path, goal)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", stop)
+        with pytest.raises(KeyboardInterrupt):
+            call("bake", row, "-o", target, *QUICK)
+    assert len(cells_only(target)) == moved
+    assert listed(target) == ([[0, 0]] if moved >= 5 else [])
+    defects = call("verify", target, "--json").object["defects"]
+    assert len(defects) == CELLS - len(listed(target))
+    assert all(defect["what"].endswith("missing: not baked yet") for defect in defects)
+    succeed("bake", row, "-o", target, *QUICK)
+    assert content(target) == row_baked
+
+
+def test_a_bake_without_the_command_line_refuses_the_same_folders(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(SettingsError, match="a bake needs a folder"):
+        job.bake(yard(), tmp_path / "file", Settings(1, 1, finest=8))
+    (tmp_path / "world.json").write_text("[]")
+    with pytest.raises(SettingsError, match="another program's file"):
+        job.bake(yard(), tmp_path, Settings(1, 1, finest=8))
