@@ -14,14 +14,14 @@ from __future__ import annotations
 import argparse
 import csv
 import math
-import subprocess
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import bpy
 import numpy as np
 from gi_volumes.benchmarks import coincident_faces, cycles_judge, scene_edits, surface_points
+from gi_volumes.benchmarks.results import commit
 
 RESULTS = Path(__file__).with_name("agreement.csv")
 TRANSPORTS = ("sky", "sun", "local")
@@ -245,47 +245,108 @@ def bright(points: np.ndarray, pilot: np.ndarray, count: int, seed: int) -> np.n
     return np.random.default_rng(seed).choice(len(points), count, replace=False, p=chance / chance.sum())
 
 
+@dataclass(frozen=True)
+class Plan:
+    """What to compare, and how well; the fields are the options of the command line, and columns of the results.
+
+    points : on surfaces
+    samples : of Cycles for each point, seed and pass
+    paths : of ours for each point and seed
+    bounces : reflections
+    seed : of the choice of points; light has its own
+    materials : "diffuse" (what the bake models) or "original"
+    against : "ours", or "cycles": the judge against itself
+    keep_coincident : whether faces that lie in others stay in the scene
+    bright : whether points are chosen by how much light arrives, not by area alone
+    """
+
+    points: int = 1000
+    samples: int = 128
+    paths: int = 512
+    bounces: int = 4
+    seed: int = 0
+    materials: str = "diffuse"
+    against: str = "ours"
+    keep_coincident: bool = False
+    bright: bool = False
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Runs of one transport at the same points.
+
+    Parameters
+    ----------
+    points, normals : (n, 3) float64 ndarray
+        World space [m], unit length.
+    ours, judge : (k, n, 3) ndarray [W/m2]
+        Independent runs.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    ours: np.ndarray
+    judge: np.ndarray
+
+
+def compare(plan: Plan, transports: Iterable[str] = TRANSPORTS) -> Iterator[Comparison]:
+    """Compare ours with Cycles on the open scene, whose materials and faces are changed.
+
+    Parameters
+    ----------
+    plan : Plan
+        What to compare.
+    transports : iterable of str
+        Keys of `cycles_judge.TRANSPORTS`.
+
+    Yields
+    ------
+    Comparison
+        One for each transport.
+    """
+    if not plan.keep_coincident:
+        removed, left = coincident_faces.remove_coincident()
+        print(f"removed {removed} faces that lie in others; {100 * left:.2f} % of the area still lies in others")
+    count = plan.points * (PILOT_CANDIDATES if plan.bright else 1)
+    candidates = surface_points.pick(surface_points.world_triangles(), count, plan.seed)
+    # Ours read the scene before the judge's edits.
+    pilot, ours = our_estimator(PILOT_PATHS, plan.bounces), our_estimator(plan.paths, plan.bounces)
+    judge = cycles_estimator(plan.samples, plan.bounces)
+    if plan.materials == "diffuse":
+        scene_edits.make_diffuse()
+    seeds, others = (tuple(range(first, first + SEEDS)) for first in (FIRST_SEED, FIRST_SEED + SEEDS))
+    for transport in transports:
+        points, normals = candidates
+        if plan.bright:
+            light = pilot(points, normals, transport, (PILOT_SEED,))[0].mean(axis=1)
+            rows = bright(points, light, plan.points, plan.seed)
+            points, normals = points[rows], normals[rows]
+        mine = (ours if plan.against == "ours" else judge)(points, normals, transport, others)
+        yield Comparison(points, normals, mine, judge(points, normals, transport, seeds))
+
+
 def main() -> None:
     """Compare, print, and append to the results."""
     options = _parse()
     added = open_scene(options.scene)
     print(f"{options.scene.name}: added {', '.join(added) or 'nothing'}")
-    if not options.keep_coincident:
-        removed, left = coincident_faces.remove_coincident()
-        print(f"removed {removed} faces that lie in others; {100 * left:.2f} % of the area still lies in others")
-    triangles = surface_points.world_triangles()
-    candidates = surface_points.pick(
-        triangles, options.points * (PILOT_CANDIDATES if options.bright else 1), options.seed
-    )
-    # Ours read the scene before the judge's edits.
-    pilot, ours = our_estimator(PILOT_PATHS, options.bounces), our_estimator(options.paths, options.bounces)
-    judge = cycles_estimator(options.samples, options.bounces)
-    if options.materials == "diffuse":
-        scene_edits.make_diffuse()
-    for transport in options.transports.split(","):
-        points, normals = _brightest(candidates, pilot, transport, options) if options.bright else candidates
-        seeds, others = (tuple(range(first, first + SEEDS)) for first in (FIRST_SEED, FIRST_SEED + SEEDS))
-        mine = (ours if options.against == "ours" else judge)(points, normals, transport, others)
-        judged = judge(points, normals, transport, seeds)
-        result = agreement(mine, judged)
+    plan = Plan(**{field.name: getattr(options, field.name) for field in fields(Plan)})
+    transports = options.transports.split(",")
+    for transport, found in zip(transports, compare(plan, transports), strict=True):
+        result = agreement(found.ours, found.judge)
         print(_line(transport, result), flush=True)
-        _print_worst(points, normals, mine, judged, options.worst)
+        _print_worst(found, options.worst)
         if options.record:
-            _append(options, transport, result)
+            _append(options.scene.name, transport, plan, result)
 
 
-def _brightest(candidates: tuple[np.ndarray, np.ndarray], pilot: Estimator, transport: str, options) -> tuple:
-    """Points and normals that the light of a transport reaches."""
-    light = pilot(*candidates, transport, (PILOT_SEED,))[0].mean(axis=1)
-    rows = bright(candidates[0], light, options.points, options.seed)
-    return candidates[0][rows], candidates[1][rows]
-
-
-def _print_worst(points: np.ndarray, normals: np.ndarray, ours: np.ndarray, judge: np.ndarray, count: int) -> None:
+def _print_worst(found: Comparison, count: int) -> None:
     """Where to look for the cause of a difference."""
-    for row in worst(ours, judge, count):
-        mine, theirs = (f"{part[:, row].mean():.5f} {part[:, row].mean(axis=1).round(5)}" for part in (ours, judge))
-        print(f"    at {points[row].round(3)} facing {normals[row].round(3)}: ours {mine}, Cycles {theirs}")
+    for row in worst(found.ours, found.judge, count):
+        mine, theirs = (
+            f"{part[:, row].mean():.5f} {part[:, row].mean(axis=1).round(5)}" for part in (found.ours, found.judge)
+        )
+        print(f"    at {found.points[row].round(3)} facing {found.normals[row].round(3)}: ours {mine}, Cycles {theirs}")
 
 
 def _parse() -> argparse.Namespace:
@@ -293,11 +354,14 @@ def _parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scene", type=Path, help=".blend, .glb or .gltf file")
     parser.add_argument("--transports", default=",".join(TRANSPORTS), help="with commas between")
-    parser.add_argument("--points", type=int, default=1000)
-    parser.add_argument("--samples", type=int, default=128, help="of Cycles for each point, seed and pass")
-    parser.add_argument("--paths", type=int, default=512, help="of ours for each point and seed")
-    parser.add_argument("--bounces", type=int, default=4)
-    parser.add_argument("--seed", type=int, default=0, help="of the choice of points")
+    for name, help in (
+        ("points", None),
+        ("samples", "of Cycles for each point, seed and pass"),
+        ("paths", "of ours for each point and seed"),
+        ("bounces", None),
+        ("seed", "of the choice of points"),
+    ):
+        parser.add_argument(f"--{name}", type=int, default=getattr(Plan, name), help=help)
     parser.add_argument("--materials", choices=("diffuse", "original"), default="diffuse")
     parser.add_argument(
         "--against", choices=("ours", "cycles"), default="ours", help="cycles: the judge against itself"
@@ -318,24 +382,16 @@ def _line(transport: str, result: Agreement) -> str:
     )
 
 
-def _append(options: argparse.Namespace, transport: str, result: Agreement) -> None:
+def _append(scene: str, transport: str, plan: Plan, result: Agreement) -> None:
     """Add a row to the results, under a header if it is the first."""
-    names = ("points", "samples", "paths", "bounces", "seed", "materials", "against", "keep_coincident", "bright")
-    row = {"commit": _commit(), "blender": bpy.app.version_string, "scene": options.scene.name, "transport": transport}
-    row |= {name: getattr(options, name) for name in names}
-    row |= {name: f"{value:.6g}" for name, value in asdict(result).items()}
+    row = {"commit": commit(), "blender": bpy.app.version_string, "scene": scene, "transport": transport}
+    row |= asdict(plan) | {name: f"{value:.6g}" for name, value in asdict(result).items()}
     is_new = not RESULTS.exists()
     with RESULTS.open("a", newline="") as file:
         writer = csv.DictWriter(file, row, lineterminator="\n")
         if is_new:
             writer.writeheader()
         writer.writerow(row)
-
-
-def _commit() -> str:
-    """The commit that is checked out, with a plus when files differ from it."""
-    command = ["git", "-C", str(RESULTS.parent), "describe", "--always", "--dirty=+", "--abbrev=9"]
-    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip() or "unknown"
 
 
 if __name__ == "__main__":
