@@ -9,8 +9,9 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import bpy
 import numpy as np
+
+from .silence import bpy, quiet  # isort: split
 
 from ..bake.snapshot import Snapshot, SnapshotError
 from . import cameras, render_depsgraph, scene_file, sky
@@ -53,11 +54,12 @@ def extract(context_or_depsgraph: bpy.types.Context | bpy.types.Depsgraph) -> Sn
         There is nothing to bake, or it holds invalid numbers; the message names the object and the remedy.
     """
     if isinstance(context_or_depsgraph, bpy.types.Depsgraph):
-        scene, view_layer = context_or_depsgraph.scene.original, context_or_depsgraph.view_layer.original
+        scene = context_or_depsgraph.scene.original
+        view_layer = scene.view_layers[context_or_depsgraph.view_layer.name]
     else:
         scene, view_layer = context_or_depsgraph.scene, context_or_depsgraph.view_layer
     notes = Notes()
-    with scene_file.quiet():
+    with quiet():
         snapshot = render_depsgraph.read(scene, view_layer, lambda depsgraph: _read(depsgraph, scene, notes))
         panorama = sky.read(scene, notes)
     _note_colors(notes)
@@ -82,7 +84,7 @@ def from_file(path: Path | str) -> Snapshot:
     SnapshotError
         The file cannot be read, or there is nothing to bake; the message is one line.
     """
-    with scene_file.quiet():
+    with quiet():
         scene_file.open_scene(Path(path))
         return extract(bpy.context)
 

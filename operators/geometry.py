@@ -6,7 +6,8 @@ bulk; Blender's member collections (`vertices`, `loops`) are ten to a hundred ti
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import bpy
@@ -67,7 +68,8 @@ class Meshes:
         slots = tuple(self.materials.index(slot.material) for slot in object.material_slots)
         key = (object.data.as_pointer(), slots)
         if key not in self._indices:
-            self._indices[key] = self._store(object.data, slots, name)
+            with _mesh_data(object) as data:
+                self._indices[key] = self._store(data, slots, name)
         index = self._indices[key]
         if index is None:
             return
@@ -200,6 +202,18 @@ def origin(low: np.ndarray, high: np.ndarray) -> np.ndarray:
         The multiple of 1024 m nearest to their centre, along each axis.
     """
     return np.rint((low + high) / 2 / KILO) * KILO + 0.0
+
+
+@contextmanager
+def _mesh_data(object: bpy.types.Object) -> Iterator[bpy.types.Mesh]:
+    """The arrays of an evaluated mesh; one that is being edited has none until it is converted."""
+    if not object.data.is_editmode:
+        yield object.data
+        return
+    try:
+        yield object.to_mesh()
+    finally:
+        object.to_mesh_clear()
 
 
 def _edges(positions: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -118,12 +118,10 @@ class Images:
             return Image(image.name, values.astype(np.float16), "float")
         if not linear and space != "sRGB":
             self._notes.add(f"colour space '{space}'", "sRGB", f"image '{image.name}'")
-        record = Image(image.name, _bytes(values), "linear" if linear else "srgb")
         if see_through and not alpha_used:
-            texels = decode(record)
-            texels[..., :3] *= texels[..., 3:]
-            record = Image(image.name, _bytes(np.dstack([_srgb(texels[..., :3]), texels[..., 3]])), "srgb")
-        return record
+            # Cycles multiplies the stored values, before it decodes them.
+            values[..., :3] *= values[..., 3:]
+        return Image(image.name, _bytes(values), "linear" if linear else "srgb")
 
     def _note_kind(self, image: bpy.types.Image) -> None:
         """Images that are more than one picture."""

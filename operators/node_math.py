@@ -116,14 +116,6 @@ def _soft_light(a: Array, b: Array) -> Array:
     return (1 - a) * b * a + a * (1 - (1 - b) * (1 - a))
 
 
-def _dodge(a: Array, b: Array) -> Array:
-    return np.where(a == 0, 0, np.where(b >= 1, 1, np.minimum(a / np.maximum(1 - b, 1e-9), 1)))
-
-
-def _burn(a: Array, b: Array) -> Array:
-    return np.where(b <= 0, 0, np.clip(1 - (1 - a) / np.maximum(b, 1e-9), 0, 1))
-
-
 def _hsv_blend(a: Array, b: Array, planes: tuple[int, ...], needs_color: bool) -> Array:
     """Replace some of a's hue, saturation, value with b's."""
     a, b = np.broadcast_arrays(a, b)
@@ -149,13 +141,25 @@ BLEND: dict[str, Callable[[Array, Array], Array]] = {
     "OVERLAY": _overlay,
     "SOFT_LIGHT": _soft_light,
     "LINEAR_LIGHT": lambda a, b: a + 2 * b - 1,
-    "DODGE": _dodge,
-    "BURN": _burn,
     "HUE": lambda a, b: _hsv_blend(a, b, (0,), True),
     "SATURATION": lambda a, b: _hsv_blend(a, b, (1,), False),
     "VALUE": lambda a, b: _hsv_blend(a, b, (2,), False),
     "COLOR": lambda a, b: _hsv_blend(a, b, (0, 1), True),
 }
+
+
+def _dodge(a: Array, b: Array, factor: Array) -> Array:
+    rest = 1 - factor * b
+    return np.where(a == 0, 0, np.where(rest <= 0, 1, np.minimum(_divide(a, rest), 1)))
+
+
+def _burn(a: Array, b: Array, factor: Array) -> Array:
+    rest = 1 - factor + factor * b
+    return np.where(rest <= 0, 0, np.clip(1 - _divide(1 - a, rest), 0, 1))
+
+
+# Blend modes that take the factor into their formula.
+FACTOR_BLEND: dict[str, Callable[[Array, Array, Array], Array]] = {"DODGE": _dodge, "BURN": _burn}
 
 
 def hsv_from_rgb(rgb: Array) -> Array:

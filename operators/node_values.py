@@ -102,6 +102,8 @@ def _mix_rgb(evaluator: Evaluator, node: bpy.types.Node, socket: bpy.types.NodeS
 
 def _blend(evaluator: Evaluator, a: Field, b: Field, factor: Field, mode: str) -> Field | None:
     """a blended towards mode(a, b), exactly where a product says it."""
+    if mode in node_math.FACTOR_BLEND:
+        return evaluator.combine(node_math.FACTOR_BLEND[mode], [a, b, factor], a.width)
     if mode not in node_math.BLEND:
         return None
     if factor.is_value(0.0):

@@ -1,15 +1,10 @@
 """Opening scene files in a Blender without a window.
 
-Comes in: a .blend, .glb or .gltf path. Goes out: the scene, open in Blender. Whatever Blender and its importers
-print goes to standard error: standard output belongs to the caller.
+Comes in: a .blend, .glb or .gltf path. Goes out: the scene, open in Blender.
 """
 
 from __future__ import annotations
 
-import os
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import bpy
@@ -17,7 +12,6 @@ import bpy
 from ..bake.snapshot import SnapshotError
 
 SUFFIXES = (".blend", ".glb", ".gltf")
-STDOUT, STDERR = 1, 2
 
 
 def open_scene(path: Path) -> None:
@@ -46,20 +40,6 @@ def open_scene(path: Path) -> None:
         _open(path)
     except Exception as error:  # importers raise anything at all on damaged files
         raise SnapshotError(f"{path}: Blender cannot read it ({_reason(error)})") from error
-
-
-@contextmanager
-def quiet() -> Iterator[None]:
-    """Send everything printed on standard output to standard error, what C++ prints as well."""
-    sys.stdout.flush()
-    saved = os.dup(STDOUT)
-    try:
-        os.dup2(STDERR, STDOUT)
-        yield
-    finally:
-        sys.stdout.flush()
-        os.dup2(saved, STDOUT)
-        os.close(saved)
 
 
 def _open(path: Path) -> None:
