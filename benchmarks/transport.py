@@ -24,7 +24,7 @@ from gi_volumes.bake.rays import Tracer
 from gi_volumes.bake.scene import prepare, scene_suns
 from gi_volumes.bake.sensors import DataPoints
 from gi_volumes.bake.settings import Settings, model
-from results import add_row
+from gi_volumes.benchmarks.results import add_row
 
 
 class Recorder(Tracer):
