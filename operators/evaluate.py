@@ -30,7 +30,14 @@ LIGHT_PATH = {"Is Diffuse Ray": 1.0, "Is Reflection Ray": 1.0, "Ray Depth": 1.0,
 class Evaluator:
     """Evaluates sockets; results are kept, since graphs share branches.
 
-    `values` maps node types to functions (`node_values.VALUES`).
+    Parameters
+    ----------
+    images : Images
+        Images and painted pictures.
+    notes : Notes
+        Gathers what cannot be represented.
+    values : dict
+        Functions by node type, `node_values.VALUES`.
 
     Attributes
     ----------
@@ -38,10 +45,6 @@ class Evaluator:
         What is being read, for notes, such as "material 'Brick'".
     graph : Graph
         Finds what feeds a socket.
-    images : Images
-        Images and painted pictures.
-    notes : Notes
-        Gathers what cannot be represented.
     """
 
     def __init__(self, images: Images, notes: Notes, values: dict[str, Callable[..., Field | None]]) -> None:

@@ -33,12 +33,14 @@ class Placement:
 class Picture:
     """Texels, (h, w, 4) float32 linear, row 0 at v = 0, read when first needed.
 
-    Attributes
+    Parameters
     ----------
     name : str
         For messages.
     placement : Placement
         How it lies on meshes.
+    load : callable
+        Returns the texels.
     image : object or None
         The image that it shows unchanged; None when painted.
     """
@@ -78,7 +80,18 @@ class Field:
         return self.picture is None and self.vertex_color is None
 
     def is_value(self, value: float) -> bool:
-        """Whether it is a constant whose components all equal `value`."""
+        """Return whether it is a constant whose components all equal a value.
+
+        Parameters
+        ----------
+        value : float
+            The value.
+
+        Returns
+        -------
+        bool
+            False for pictures and vertex colours.
+        """
         return self.is_constant and all(component == value for component in self.factor)
 
     def mean(self) -> np.ndarray:

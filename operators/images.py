@@ -23,6 +23,11 @@ MISSING_GREY = 0.8
 class Images:
     """Images read so far.
 
+    Parameters
+    ----------
+    notes : Notes
+        Gathers what cannot be represented.
+
     Attributes
     ----------
     records : list of Image

@@ -36,6 +36,11 @@ class Reads:
 class Materials:
     """Materials read so far.
 
+    Parameters
+    ----------
+    evaluator : Evaluator
+        Evaluates the inputs of shaders.
+
     Attributes
     ----------
     records : list of Material

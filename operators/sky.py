@@ -28,8 +28,9 @@ SAMPLES = 16
 TILE = 32
 # Tiles with spots are rendered with this many texels for each of the panorama's, along both sides.
 FINER, FINER_SAMPLES = 8, 16
-# A tile has a bright spot when its brightest texel exceeds its median by this factor.
-SPOT_CONTRAST = 20.0
+# A tile has a bright spot when its brightest texel exceeds its mean by this factor, and holds this share of all light.
+SPOT_CONTRAST = 8.0
+SPOT_SHARE = 1e-3
 # A sun at the zenith touches all 16 tiles of the last row.
 MAX_SPOTS = 20
 # With this rotation Cycles' panorama has +x at its centre and z up: the map of `Snapshot.sky`.
@@ -99,14 +100,15 @@ def _panorama(scene: bpy.types.Scene, world: bpy.types.World) -> np.ndarray:
 
 
 def _spots(panorama: np.ndarray) -> list[tuple[int, int]]:
-    """First row and column of the tiles with the brightest spots."""
-    tiles = panorama.max(2).reshape(HEIGHT // TILE, TILE, WIDTH // TILE, TILE).swapaxes(1, 2)
-    tiles = tiles.reshape(*tiles.shape[:2], -1)
-    peak = tiles.max(2)
-    contrast = peak / np.maximum(np.median(tiles, axis=2), 1e-6)
-    order = np.argsort(-(peak * (contrast > SPOT_CONTRAST)), axis=None)[:MAX_SPOTS]
-    chosen = [np.unravel_index(index, peak.shape) for index in order if contrast.flat[index] > SPOT_CONTRAST]
-    return [(int(row) * TILE, int(column) * TILE) for row, column in chosen]
+    """First row and column of the tiles whose light comes from a few texels and matters, brightest first."""
+    elevation = ((np.arange(HEIGHT) + 0.5) / HEIGHT - 0.5) * math.pi
+    light = np.maximum(panorama.max(2), 0, dtype=np.float64) * np.cos(elevation)[:, None]
+    tiles = light.reshape(HEIGHT // TILE, TILE, WIDTH // TILE, TILE).swapaxes(1, 2).reshape(-1, TILE * TILE)
+    total = tiles.sum(1)
+    matters = (tiles.max(1) > SPOT_CONTRAST * tiles.mean(1)) & (total > SPOT_SHARE * total.sum())
+    order = np.argsort(-total * matters, kind="stable")[: min(MAX_SPOTS, int(matters.sum()))]
+    rows, columns = np.divmod(order, WIDTH // TILE)
+    return [(row * TILE, column * TILE) for row, column in zip(rows.tolist(), columns.tolist(), strict=True)]
 
 
 @contextmanager
