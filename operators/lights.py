@@ -62,7 +62,10 @@ class Lamps:
         color = _color(data) * self._node_color(data, name)
         if not (np.isfinite(matrix).all() and np.isfinite(color).all()):
             raise SnapshotError(f"lamp '{name}' has an invalid position or strength: give it finite numbers")
-        if (color <= 0).all():
+        if (color < 0).any():
+            self.notes.add("negative lamp", "no light", f"'{name}'")
+            color = np.maximum(color, 0)
+        if not color.any():
             return
         frame, scale = _frame(matrix)
         kind, strength, size, spot = self._shape(data, color, scale, name)

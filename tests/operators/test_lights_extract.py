@@ -136,6 +136,24 @@ def test_hidden_dark_and_portal_lamps_are_no_lamps(studio, extract):
     assert extract().lights.names == ("unseen in the viewport",)
 
 
+def test_negative_light_becomes_none_and_is_noted(studio, extract):
+    studio.lamp("POINT", "negative", energy=-5.0)
+    mixed = studio.lamp("SUN", "mixed", energy=2.0).data
+    mixed.use_nodes = True
+    emission = next(node for node in mixed.node_tree.nodes if node.type == "EMISSION")
+    below = studio.node(mixed, "ShaderNodeCombineXYZ", X=-0.5, Y=0.25, Z=1.0)
+    mixed.node_tree.links.new(below.outputs[0], emission.inputs["Color"])
+    studio.lamp("POINT", "positive")
+    studio.wear()
+    found = extract()
+    assert set(found.lights.names) == {"mixed", "positive"}
+    strength = found.lights.strength[found.lights.names.index("mixed")]
+    np.testing.assert_allclose(strength, (0, 0.5, 2), rtol=1e-6)
+    (note,) = [note for note in found.notes if "negative" in note.what]
+    assert {"'negative'", "'mixed'"} == set(note.what.partition("(")[2].rstrip(")").split(", "))
+    assert note.why == "no light"
+
+
 def test_instanced_lamps_shine_at_each_instance(studio, extract):
     collection = studio.bpy.data.collections.new("lamps")
     lamp = studio.bpy.data.objects.new("lamp", studio.bpy.data.lights.new("lamp", "POINT"))
