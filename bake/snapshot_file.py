@@ -31,6 +31,8 @@ from .snapshot import (
 from .textures import EXTENSIONS
 
 KIND = "snapshot"
+VERSION = 1
+"""Of the definition. Fields added later have defaults and keep it; a change of meaning raises it."""
 
 GEOMETRY_LAYOUT = {
     "positions": (np.float32, (None, 3)),
@@ -114,7 +116,7 @@ def load(path: Path | str) -> Snapshot:
 
 
 def digest(snapshot: Snapshot) -> str:
-    """Hash everything that a bake depends on: not the cameras, the notes, or where the scene came from.
+    """Hash everything that a bake depends on: no names, cameras or notes, nor where the scene came from.
 
     Parameters
     ----------
@@ -126,14 +128,28 @@ def digest(snapshot: Snapshot) -> str:
     str
         32 hexadecimal digits; equal for equal scenes on every machine.
     """
-    plain = dataclasses.replace(snapshot, cameras=(), notes=(), source="")
-    arrays, meta = _to_container(plain)
+    arrays, meta = _to_container(_nameless(snapshot))
     state = hashlib.blake2b(json.dumps(meta, sort_keys=True).encode(), digest_size=16)
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
         state.update(f"{name}{array.dtype.str}{array.shape}".encode())
         state.update(array.data)
     return state.hexdigest()
+
+
+def _nameless(snapshot: Snapshot) -> Snapshot:
+    """What light depends on: renaming things must not ask for a new bake."""
+    geometry = dataclasses.replace(snapshot.geometry, instance_names=("",) * len(snapshot.geometry.instance_names))
+    return dataclasses.replace(
+        snapshot,
+        geometry=geometry,
+        materials=tuple(dataclasses.replace(material, name="") for material in snapshot.materials),
+        images=tuple(dataclasses.replace(image, name="") for image in snapshot.images),
+        lights=dataclasses.replace(snapshot.lights, names=("",) * len(snapshot.lights.names)),
+        cameras=(),
+        notes=(),
+        source="",
+    )
 
 
 def check(snapshot: Snapshot) -> None:
@@ -281,6 +297,7 @@ def _to_container(snapshot: Snapshot) -> tuple[dict[str, np.ndarray], dict]:
     arrays |= {f"image/{i}": image.pixels for i, image in enumerate(snapshot.images)}
     arrays |= {"sky": snapshot.sky, "origin": snapshot.origin}
     meta = {
+        "version": VERSION,
         "instance_names": list(snapshot.geometry.instance_names),
         "light_names": list(snapshot.lights.names),
         "images": [{"name": image.name, "encoding": image.encoding} for image in snapshot.images],
@@ -293,6 +310,8 @@ def _to_container(snapshot: Snapshot) -> tuple[dict[str, np.ndarray], dict]:
 
 
 def _from_container(arrays: dict[str, np.ndarray], meta: dict) -> Snapshot:
+    if _build(int, meta["version"]) > VERSION:
+        raise ValueError(f"version {meta['version']}; this program reads up to {VERSION}")
     geometry = {name: arrays[f"geometry/{name}"] for name in GEOMETRY_LAYOUT}
     lights = {name: arrays[f"lights/{name}"] for name in LIGHTS_LAYOUT}
     labels = [(_build(str, entry["name"]), _build(str, entry["encoding"])) for entry in meta["images"]]
@@ -313,9 +332,12 @@ def _build(kind, value):
     """A value from outside as what a record's field is declared to be; anything else is a ValueError."""
     if dataclasses.is_dataclass(kind):
         kinds = typing.get_type_hints(kind)
-        if not isinstance(value, dict) or set(value) != set(kinds):
+        if not isinstance(value, dict) or not set(value) <= set(kinds):
             raise ValueError(f"{kind.__name__} has the fields {', '.join(kinds)}")
-        return kind(**{name: _build(kinds[name], value[name]) for name in kinds})
+        missing = {f.name for f in dataclasses.fields(kind) if f.default is dataclasses.MISSING} - set(value)
+        if missing:
+            raise ValueError(f"{kind.__name__} lacks {', '.join(sorted(missing))}")
+        return kind(**{name: _build(kinds[name], value[name]) for name in value})
     parts = typing.get_args(kind)
     if typing.get_origin(kind) is tuple:
         if not isinstance(value, (list, tuple)):
