@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..tree.cells import OFFSET_STEPS
 from . import warp
 from .gather import TILE_LANES, run_tiles
 from .rays import MISS
@@ -30,8 +31,8 @@ CANDIDATES = 8
 CLEARANCE = 0.04
 """How far beyond the surface a moved point goes, in voxels: a tenth of the way to the next finer point."""
 
-OFFSET_STEPS = 254
-"""A voxel has this many steps of a stored offset along each axis."""
+FARTHEST_STEP = OFFSET_STEPS // 2
+"""Half a voxel."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,7 @@ def place(
     valid = np.ones(len(center), bool)
 
     def work(rows: np.ndarray) -> int:
-        inside, ways = _judge(scene, _moved(center[rows], offset[rows], size[rows]), key[rows], size[rows])
+        inside, ways = _judge(scene, center[rows], key[rows])
         valid[rows[inside]] = False
         _move_out(scene, center, size, key, rows[inside], ways, offset, valid)
         return len(rows)
@@ -144,30 +145,33 @@ def morton_order(position: np.ndarray) -> np.ndarray:
     return np.argsort(code, kind="stable")
 
 
-def _judge(scene: Scene, position: np.ndarray, key: np.ndarray, size: np.ndarray):
-    """(rows that are inside, (rows, CANDIDATES, 3) float64 vectors through the nearest backs, NaN for none)."""
+def _judge(scene: Scene, position: np.ndarray, key: np.ndarray):
+    """(rows that are inside, ways out): (rows, CANDIDATES, 3) directions and (rows, CANDIDATES) metres to backs."""
     direction, distance, back = _probe(scene, position, key)
     inside = np.flatnonzero(back.mean(axis=1) > BACKFACE_LIMIT)
     reach = np.where(back[inside], distance[inside], np.inf)
     nearest = np.argsort(reach, axis=1, kind="stable")[:, :CANDIDATES]
-    length = np.take_along_axis(reach, nearest, axis=1) + CLEARANCE * size[inside, None]
     toward = direction[inside][np.arange(len(inside))[:, None], nearest]
-    ways = toward * np.where(np.isfinite(length), length, np.nan)[:, :, None]
-    return inside, ways
+    return inside, (toward, np.take_along_axis(reach, nearest, axis=1))
 
 
 def _move_out(scene: Scene, center, size, key, rows, ways, offset, valid) -> None:
-    """Try the ways out, nearest first; the first that leads to free space wins."""
-    for attempt in range(ways.shape[1]):
-        left = np.flatnonzero(~valid[rows])
-        steps = np.round(ways[left, attempt] / size[rows[left], None] * OFFSET_STEPS)
-        fits = (np.abs(steps) <= OFFSET_STEPS // 2).all(axis=1)
-        left, steps = left[fits], steps[fits].astype(np.int8)
-        if not len(left):
+    """Try the ways out, nearest first; the first that leads to free space wins.
+
+    A surface inside the voxel can be passed even where the clearance behind it ends at the voxel's border.
+    """
+    toward, reach = ways
+    for attempt in range(reach.shape[1]):
+        left = np.flatnonzero(~valid[rows] & np.isfinite(reach[:, attempt]))
+        voxel = size[rows[left], None]
+        met = toward[left, attempt] * reach[left, attempt, None] / voxel
+        beyond = met + toward[left, attempt] * CLEARANCE
+        fits = (np.abs(met) <= 0.5).all(axis=1)
+        steps = np.clip(np.round(beyond[fits] * OFFSET_STEPS), -FARTHEST_STEP, FARTHEST_STEP).astype(np.int8)
+        tried = rows[left[fits]]
+        if not len(tried):
             continue
-        tried = rows[left]
-        moved = _moved(center[tried], steps, size[tried])
-        back = _probe(scene, moved, key[tried])[2]
+        back = _probe(scene, _moved(center[tried], steps, size[tried]), key[tried])[2]
         free = back.mean(axis=1) <= BACKFACE_LIMIT
         offset[tried[free]] = steps[free]
         valid[tried[free]] = True

@@ -229,6 +229,7 @@ def _sun_header(snapshot: Snapshot, settings: Settings, light: Model) -> dict:
         "unit": "1, irradiance per W/m2 of sun on a surface facing it",
         "directions": light.suns.toward.tolist(),
         "diameters": light.suns.diameter.tolist(),
+        "free": has_free_sun(settings.sun),
         "scene": [
             {"direction": direction.tolist(), "irradiance": irradiance.tolist()}
             for direction, irradiance in zip(shining, strength, strict=True)

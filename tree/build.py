@@ -3,7 +3,8 @@
 Comes in: triangles in local metres. Goes out: a `Topology`, or None where the cell has no geometry.
 
 The dense first level covers the geometry's extent within the cell, in whole voxels: from the one that holds the
-lowest coordinate to the one that holds the highest, on each axis. Below it a voxel exists where it overlaps a
+lowest coordinate to the one that holds the highest, on each axis, and one more at the sides and the top where
+geometry comes close to the border. Below it a voxel exists where it overlaps a
 triangle, touching included, and its parent is subdivided. Pairs of triangle and voxel go from level to level: the
 children of a pair are tested only against its own triangle.
 """
@@ -21,6 +22,8 @@ from .topology import MAX_POINTS, Topology, child_coords, link_blocks
 
 __all__ = ["build", "occupied_cells"]
 
+ROOM = 0.5
+"""Free space that the dense grid keeps between geometry and its sides and top [first-level voxels]."""
 CHUNK = 1 << 18
 """Pairs tested at a time: about 100 MB of temporaries."""
 
@@ -59,6 +62,7 @@ def build(
     if not proper.any():
         return None
     low, high, left_out = _first_bounds(coords[proper], min(max_points, MAX_POINTS))
+    low, high = _with_room(surfaces, triangle[proper], coords[proper], (low, high), grid, cell, max_points)
     inside = ((coords >= low) & (coords <= high)).all(axis=1)
     shape = high - low + 1
     voxels = _number_first(triangle[inside], coords[inside] - low, low, shape, grid.first_size)
@@ -182,6 +186,30 @@ def _first_bounds(coords: np.ndarray, max_points: int) -> tuple[np.ndarray, np.n
     low[2] = z[np.argmax(held)]
     high[2] = min(low[2] + layers - 1, high[2])
     return low, high, len(z) - int(held.max())
+
+
+def _with_room(
+    surfaces: Surfaces,
+    triangle: np.ndarray,
+    coords: np.ndarray,
+    extent: tuple[np.ndarray, np.ndarray],
+    grid: Grid,
+    cell: tuple[int, int],
+    max_points: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Grow the dense grid at the sides and the top where geometry comes close: what faces outwards there, or stands
+    on a ground just below a layer's border, needs data points in the open. The cell's own columns are the limit."""
+    size, room = grid.first_size, ROOM * grid.first_size
+    lowest, highest = _bounds(surfaces.corners)
+    inside_low = np.maximum(lowest[triangle], coords * size).min(axis=0)
+    inside_high = np.minimum(highest[triangle], (coords + 1) * size).max(axis=0)
+    columns = np.asarray(cell) * CELL_VOXELS
+    low, high = (values.copy() for values in extent)
+    low[:2] -= (inside_low - extent[0] * size < room)[:2] & (low[:2] > columns)
+    high[:2] += ((extent[1] + 1) * size - inside_high < room)[:2] & (high[:2] < columns + CELL_VOXELS - 1)
+    high[2] += (extent[1][2] + 1) * size - inside_high[2] < room
+    fits = np.prod(high - low + 1) <= min(max_points, MAX_POINTS) // 2
+    return (low, high) if fits else extent
 
 
 def _number_first(triangle: np.ndarray, place: np.ndarray, low: np.ndarray, shape: np.ndarray, size: float) -> Voxels:

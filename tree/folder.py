@@ -35,6 +35,9 @@ FILE_NAME = re.compile(r"cell_(-?\d+)_(-?\d+)\.(tree|points|local|sun|sky)")
 def assemble(folder: str | os.PathLike, header: dict) -> dict:
     """Write `world.json` from the cells that belong to a bake.
 
+    Processes that bake other cells into the folder may do the same at the same time: whoever writes last looks
+    again afterwards, and so lists all cells.
+
     Parameters
     ----------
     folder : str or Path

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .cells import OFFSET_STEPS
 from .grid import Grid
 from .lookup import Atlas
 
@@ -120,7 +121,7 @@ def _cosines(
     data: DataPoints, size: float, coords: np.ndarray, row: np.ndarray, points: np.ndarray, normals: np.ndarray
 ) -> np.ndarray:
     """Cosine between the normal and the direction to each data point, 0 behind the surface."""
-    step = size / 254.0
+    step = size / OFFSET_STEPS
     arm = (coords + 0.5) * size + data.offset[row] * step - points[:, None]
     length = np.sqrt(np.einsum("nci,nci->nc", arm, arm))
     cosine = np.einsum("nci,ni->nc", arm, normals) / np.maximum(length, AT_POINT * size)

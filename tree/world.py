@@ -24,6 +24,8 @@ from .suns import SunKeys
 __all__ = ["TRANSPORTS", "World", "load"]
 
 TRANSPORTS = ("all", "local", "sun", "sky")
+FIXED_SUN = np.radians(1.0)
+"""How far from a baked direction a fixed sun may be asked for [rad]: two disks of the sun."""
 CHUNK = 1 << 15
 """Points handled at a time: about 100 MB of temporaries."""
 
@@ -75,6 +77,7 @@ class World:
         self._values = {name: _join(name, cells, self._data.atlas) for name in names}
         sun = header.get("transports", {}).get("sun") or {}
         self._keys = SunKeys(np.array(sun["directions"])) if sun.get("directions") else None
+        self._sun_is_free = bool(sun.get("free", True))
         own = sun.get("scene") or []
         self._own_direction = np.array([entry["direction"] for entry in own], np.float64).reshape(-1, 3)
         self._own_irradiance = np.array([entry["irradiance"] for entry in own], np.float64).reshape(-1, 3)
@@ -102,7 +105,7 @@ class World:
             Away from the surface, of any length; zero gives the mean over all directions.
         sun : (direction, irradiance), optional
             Direction to the sun, and its irradiance on a surface that faces it, a number or (3,) [W/m2]; the
-            scene's own suns when None.
+            scene's own suns when None. A bake of fixed suns knows their directions only.
         sky : float, (3,) or (9, 3), optional
             Factor of the scene's own sky, or the harmonics of another sky's radiance [W/(m2 sr)], for a bake that
             holds the response to them; the scene's own sky when None.
@@ -117,7 +120,8 @@ class World:
         Raises
         ------
         ValueError
-            For wrong shapes, input that is not finite, an unknown transport, a sky that the bake cannot represent.
+            For wrong shapes, input that is not finite, an unknown transport, a sun or a sky that the bake cannot
+            represent.
 
         Notes
         -----
@@ -142,7 +146,7 @@ class World:
         total = np.zeros((len(points), 3), np.float32)
         for name, factor in factors.items():
             total += np.maximum(_sum(self._values[name], factor, row, weight, functions), 0.0)
-        return np.nan_to_num(total, nan=0.0, posinf=float(np.finfo(np.float32).max))
+        return np.minimum(total, np.finfo(np.float32).max)
 
     def _factors(self, sun: tuple | None, sky: np.ndarray | float | None, transport: str) -> dict[str, np.ndarray]:
         """(K, 3) factors of the functions of each transport that counts."""
@@ -159,6 +163,7 @@ class World:
         else:
             direction = _finite(sun[0], "sun direction").reshape(-1, 3)
             irradiance = np.broadcast_to(_finite(sun[1], "sun irradiance"), (len(direction), 3))
+            self._check_sun(direction)
         if (irradiance < 0).any():
             raise ValueError("the sun's irradiance is negative")
         if "sun" not in self._values or self._keys is None:
@@ -175,6 +180,18 @@ class World:
                 part = weight[:, corner] * irradiance[:, channel]
                 factor[:, channel] += np.bincount(index[:, corner], part, len(factor))
         return factor
+
+    def _check_sun(self, direction: np.ndarray) -> None:
+        """A bake of fixed suns knows no other direction; to answer as if it did would be a guess."""
+        if self._sun_is_free or self._keys is None or not len(direction):
+            return
+        length = np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+        nearest = (direction / length @ self._keys.directions.T).max(axis=1)
+        if (nearest < np.cos(FIXED_SUN)).any():
+            known = "; ".join(",".join(f"{value:.3g}" for value in key) for key in self._keys.directions)
+            raise ValueError(
+                f"the bake holds the sun at {known} only; bake with --sun hemisphere or arc:FILE to move it"
+            )
 
     def _sky_factor(self, sky: np.ndarray | float | None) -> np.ndarray | None:
         """Weights of the sky's functions."""

@@ -62,9 +62,22 @@ def test_touching_counts_below_the_first_level():
 
 
 def test_the_dense_level_covers_the_extent_from_floor_to_floor():
-    topology = build.build(meshes.box((1.0, 9.0, 0.0), (31.0, 15.0, 16.0)), Grid(), (0, 0))
-    assert (topology.grid_min, topology.grid_shape) == ((0, 1, 0), (4, 1, 3))
-    assert (topology.voxels()[0] == 0).sum() == 12
+    topology = build.build(meshes.box((5.0, 13.0, 0.0), (27.0, 19.0, 16.0)), Grid(), (0, 0))
+    assert (topology.grid_min, topology.grid_shape) == ((0, 1, 0), (4, 2, 3))
+    assert (topology.voxels()[0] == 0).sum() == 24
+
+
+@pytest.mark.parametrize("height", [-0.02, -0.2, 7.98, 5.0])
+def test_ground_close_below_a_layer_s_border_gets_a_layer_of_open_space_above_it(height):
+    topology = build.build(meshes.ground(60.0) + np.float32([0, 0, height]), Grid(), (0, 0))
+    assert topology.grid_shape[2] == 2
+    assert topology.grid_min[2] + 1 == np.floor(height / 8) + 1
+
+
+def test_facades_close_to_the_border_get_voxels_in_front_of_them_within_the_cell():
+    topology = build.build(meshes.box((9.0, 0.5, 1.0), (31.0, 12.0, 3.0)), Grid(), (0, 0))
+    assert topology.grid_min[:2] == (0, 0)
+    assert topology.grid_shape[:2] == (5, 2)
 
 
 def test_order_of_triangles_does_not_matter():
@@ -114,7 +127,7 @@ def test_two_parallel_sheets_are_not_one_plane():
 def test_triangles_without_area_are_solid_but_ask_for_nothing():
     point, segment = np.full((1, 3, 3), 3.0), np.array([[[1, 1, 1], [5, 5, 5], [3, 3, 3]]])
     degenerate = np.concatenate([point, segment]).astype(np.float32)
-    assert build.build(degenerate, Grid(), (0, 0)).size == 1
+    assert (build.build(degenerate, Grid(), (0, 0)).nodes["mask"] == 0).all()
     topology = build.build(degenerate, Grid(), (0, 0), flat=ALL)
     expected = expected_voxels(degenerate, Grid(), topology)
     assert as_sets(topology) == [set(map(tuple, coords.tolist())) for coords in expected]
