@@ -86,7 +86,7 @@ def from_file(path: Path | str) -> Snapshot:
     """
     with quiet():
         scene_file.open_scene(Path(path))
-        return extract(bpy.context)
+        return replace(extract(bpy.context), source=str(path))
 
 
 def _read(depsgraph: bpy.types.Depsgraph, scene: bpy.types.Scene, notes: Notes) -> Snapshot:
