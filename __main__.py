@@ -111,4 +111,5 @@ def _stop_like_ctrl_c() -> None:
 
 if __name__ == "__main__":
     _stop_like_ctrl_c()
+    importlib.import_module(".operators.worker", package().__name__).stop_with_parent()
     sys.exit(main(sys.argv[1:]))

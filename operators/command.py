@@ -81,7 +81,6 @@ def _defaults(given: list[str]) -> list[str]:
 
 def _run(argv: list[str]) -> int:
     """Until the worker ends; its output is ours, and Ctrl-C reaches it."""
-    process = worker.start(argv)
-    with bake_operator.interrupts(lambda: worker.interrupt(process)):
+    with worker.start(argv) as process, bake_operator.interrupts(lambda: worker.interrupt(process)):
         code = process.wait()
     return worker.INTERRUPTED if code < 0 else code

@@ -1,17 +1,20 @@
 """One bake in a process of its own: start, poll, stop.
 
 Comes in: the arguments of a command. Goes out: progress, then a result or a one-line error. The worker writes
-JSON lines to a file, which is read from where the last poll ended: nothing here blocks, no thread is needed,
-and no full pipe can stall the worker. Neither side needs `bpy` here.
+JSON lines to a file, which is read from where the last poll ended: nothing blocks the parent, and no full pipe
+can stall the worker. The worker's standard input is a pipe that the parent holds and never writes to: when it
+breaks, the parent is gone, and the worker stops. Neither side needs `bpy` here.
 """
 
 from __future__ import annotations
 
+import _thread
 import json
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +25,8 @@ ROOT = Path(__file__).resolve().parent.parent
 INTERRUPTED = 130
 # Time for the cells in flight to be put away before the process is killed; files are replaced atomically.
 PATIENCE_S = 15.0
+# Tells a command that it is a worker and that its standard input is its parent's pipe.
+ORPHAN_VARIABLE = "GI_VOLUMES_STOP_WITH_PARENT"
 
 
 @dataclass(frozen=True)
@@ -72,7 +77,7 @@ def duration(seconds: float) -> str:
 
 
 def start(arguments: list[str], **streams) -> subprocess.Popen:
-    """Start a command of `gi_volumes` with this Python, in a process group of its own.
+    """Start a command of `gi_volumes` with this Python, in a process group of its own; it ends when we are gone.
 
     Parameters
     ----------
@@ -84,13 +89,43 @@ def start(arguments: list[str], **streams) -> subprocess.Popen:
     Returns
     -------
     subprocess.Popen
-        The process.
+        The process; closing its standard input stops it.
     """
     # In a group of its own, so that Ctrl-C in a terminal reaches Blender, and through it the worker, once.
     group = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP} if os.name == "nt" else {"process_group": 0}
-    variables = {**os.environ, "PYTHONPATH": dependencies.search_path(), "PYTHONUNBUFFERED": "1"}
+    variables = {**os.environ, "PYTHONPATH": dependencies.search_path(), "PYTHONUNBUFFERED": "1", ORPHAN_VARIABLE: "1"}
     command = [sys.executable, "-P", "-s", str(ROOT / "__main__.py"), *arguments]
-    return subprocess.Popen(command, stdin=subprocess.DEVNULL, env=variables, **group, **streams)
+    return subprocess.Popen(command, stdin=subprocess.PIPE, env=variables, **group, **streams)
+
+
+def stop_with_parent() -> None:
+    """In a worker: interrupt this process once its parent is gone, and end it if it does not heed that.
+
+    Nothing happens in a process that `start` did not start. What this process starts in turn is no worker.
+    """
+    if os.environ.pop(ORPHAN_VARIABLE, None) is None:
+        return
+    # Away from standard input, which on Windows others cannot even ask about while a thread reads from it.
+    pipe = os.dup(0)
+    nothing = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(nothing, 0)
+    os.close(nothing)
+    threading.Thread(target=_outlive, args=(pipe,), daemon=True).start()
+
+
+def _outlive(pipe: int) -> None:
+    """Wait for the pipe to break: the system closes the other end, however the parent ended."""
+    try:
+        while os.read(pipe, 1):
+            pass
+    except OSError:  # another way for a pipe to break
+        pass
+    if hasattr(signal, "pthread_kill"):  # wakes a thread that waits for a lock, too
+        signal.pthread_kill(threading.main_thread().ident, signal.SIGTERM)
+    else:
+        _thread.interrupt_main(signal.SIGTERM)
+    time.sleep(PATIENCE_S)
+    os._exit(INTERRUPTED)
 
 
 def interrupt(process: subprocess.Popen) -> None:
@@ -141,6 +176,7 @@ class Worker:
             if self._stopped_at is not None and time.monotonic() - self._stopped_at > PATIENCE_S:
                 self._process.kill()
             return True
+        self._hang_up()
         if self.result is None and not self.error:
             self.error = self._last_words(code)
         return False
@@ -171,6 +207,11 @@ class Worker:
     def stopped(self) -> bool:
         """Whether the worker was asked to stop, or was interrupted from outside."""
         return self._stopped_at is not None or self._process.poll() == INTERRUPTED
+
+    def _hang_up(self) -> None:
+        """The worker has ended: nobody listens to the pipe."""
+        if self._process.stdin is not None:
+            self._process.stdin.close()
 
     def _read(self) -> None:
         """Only whole lines: the last one may still be on its way."""

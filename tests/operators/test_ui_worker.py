@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 from gi_volumes.operators import dependencies, worker
@@ -128,6 +130,110 @@ def test_another_python_without_site_packages_finds_the_libraries_by_the_path_th
 
 
 def test_a_worker_is_our_command_line():
-    process = worker.start(["snapshot"], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-    _, said = process.communicate(timeout=60)
-    assert (process.returncode, said.startswith(b"usage: gi_volumes snapshot")) == (2, True)
+    with worker.start(["snapshot"], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
+        said = process.stderr.read()
+        code = process.wait(60)
+    assert (code, said.startswith(b"usage: gi_volumes snapshot")) == (2, True)
+
+
+LONG_CLI = """
+import os, subprocess, sys, threading, time
+from pathlib import Path
+
+def main(argv, extract):
+    how, folder = argv[0], Path(argv[1])
+    if how == "family":
+        child = subprocess.run([sys.executable, sys.argv[0], "read", argv[1]], stdin=subprocess.DEVNULL)
+        (folder / "child").write_text(str(child.returncode))
+    if how == "read":
+        (folder / "read").write_text(repr(sys.stdin.read()))
+        return 0
+    (folder / "pid").write_text(str(os.getpid()))
+    (folder / "started").touch()
+    end = time.monotonic() + 60
+    while time.monotonic() < end:
+        try:
+            threading.Event().wait(60) if how == "blocked" else time.sleep(0.01)
+        except KeyboardInterrupt:
+            (folder / "kept").touch()
+            if how != "stubborn":
+                raise
+    (folder / "finished").touch()
+    return 0
+"""
+HOLDER = """
+import sys, time
+from pathlib import Path
+sys.path.insert(0, str(Path(sys.argv[1]).parent))
+from {package}.operators import worker
+running = worker.Worker([sys.argv[2], sys.argv[3]], Path(sys.argv[3]))
+Path(sys.argv[3], "held").touch()
+time.sleep(60)
+"""
+
+
+@pytest.fixture
+def home(repository, tmp_path):
+    """The package under another name, with a command that takes long."""
+    place = tmp_path / "package"
+    place.mkdir()
+    for name in ("__init__.py", "__main__.py"):
+        shutil.copy(repository / name, place)
+    shutil.copytree(repository / "operators", place / "operators", ignore=shutil.ignore_patterns("__pycache__"))
+    (place / "bake").mkdir()
+    (place / "bake" / "cli.py").write_text(LONG_CLI)
+    text = (place / "operators" / "worker.py").read_text()
+    (place / "operators" / "worker.py").write_text(text.replace("PATIENCE_S = 15.0", "PATIENCE_S = 1.0"))
+    return place
+
+
+def until(condition, seconds: float = 20.0) -> None:
+    """Wait for a condition."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it does not happen"
+        time.sleep(0.02)
+
+
+def runs(folder: Path) -> bool:
+    """Whether the worker that left its number in a folder is alive."""
+    state = Path("/proc") / (folder / "pid").read_text() / "stat"
+    return state.exists() and state.read_text().rpartition(") ")[2][0] != "Z"
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for the worker in /proc")
+@pytest.mark.parametrize("how", ["busy", "blocked", "stubborn", "family"])
+def test_a_worker_ends_by_itself_when_its_parent_is_killed(home, tmp_path, how):
+    program = HOLDER.format(package=home.name)
+    parent = subprocess.Popen([sys.executable, "-c", program, str(home), how, str(tmp_path)])
+    try:
+        until((tmp_path / "started").exists)
+        time.sleep(0.3)
+        assert runs(tmp_path), "it must not end before its parent"
+    finally:
+        parent.kill()
+        parent.wait()
+    until(lambda: not runs(tmp_path))
+    assert (tmp_path / "kept").exists()
+    assert not (tmp_path / "finished").exists()
+
+
+def test_a_command_that_a_worker_starts_is_not_taken_for_an_orphan(home, tmp_path, monkeypatch):
+    monkeypatch.setattr(worker, "ROOT", home)
+    running = worker.Worker(["family", str(tmp_path)], tmp_path)
+    until((tmp_path / "started").exists)
+    assert ((tmp_path / "child").read_text(), (tmp_path / "read").read_text()) == ("0", "''")
+    running.wait(10)
+    assert running.stopped
+
+
+def test_a_command_that_is_no_worker_does_not_mind_an_empty_standard_input(home, tmp_path):
+    command = [sys.executable, str(home / "__main__.py"), "busy", str(tmp_path)]
+    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        until((tmp_path / "started").exists)
+        time.sleep(0.5)
+        assert process.poll() is None
+    finally:
+        process.kill()
+        process.wait()
