@@ -66,15 +66,15 @@ def _with_snapshot(argv: list[str], snapshot: Path) -> list[str]:
         job.write_snapshot(snapshot)
     else:
         snapshot_command.write(Path(scene), snapshot)
-    return [argv[0], str(snapshot), *rest, *(_defaults(rest) if argv[0] == "bake" else [])]
+    return [argv[0], str(snapshot), *(_defaults(rest) if argv[0] == "bake" else []), *rest]
 
 
 def _defaults(given: list[str]) -> list[str]:
-    """The scene's settings for what the command line leaves open."""
-    named = {text.split("=")[0] for text in given}
+    """The scene's settings; they come before the given words, the last of which wins."""
     scene = bpy.context.scene
-    options = {name: value for name, value in properties.arguments(scene).items() if name not in named}
-    if not {"-o", "--output"} & named:
+    options = properties.arguments(scene)
+    # The scene's folder may be unusable, which matters only where no other is given.
+    if not any(text.startswith(("-o", "--output")) for text in given):
         options["-o"] = str(properties.output_folder(scene))
     return [text for pair in options.items() for text in pair]
 

@@ -26,7 +26,10 @@ def say(**message):
 
 def main(argv, extract):
     how = os.environ.get("STAND_IN", "finish")
-    folder = Path(argv[argv.index("-o") + 1])
+    import argparse
+    parser = argparse.ArgumentParser()
+    parser.add_argument("-o", "--output", type=Path)
+    folder = parser.parse_known_args(argv)[0].output
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "argv.json").write_text(json.dumps([argv, "bpy" in sys.modules, Path(argv[1]).stat().st_size]))
     print("a line that is not ours")
@@ -268,15 +271,26 @@ from bl_ext.dev.gi_volumes.operators import command
 scene.gi_volumes.quality = "final"
 print("CODE", command.main(["bake", "--seed", "7"]))
 print("ARGV", json.loads((output / "argv.json").read_text())[0][2:])
-print("CODE", command.main(["bake", "-o", str(output / "other"), "--quality=draft"]))
-print("ARGV", json.loads((output / "other" / "argv.json").read_text())[0][2:])
 """)
+    assert said.count("CODE 0") == 1
+    settings = ["--quality", "final", "--sun", "scene", "--sky", "scene", "--seed", "0", "-o", str(tmp_path / "out")]
+    assert f"ARGV {[*settings, '--seed', '7']}" in said
+
+
+@pytest.mark.parametrize("words", [["-o", "{}"], ["-o{}"], ["--output={}"], ["--output", "{}"]])
+def test_the_words_of_the_command_line_win_over_the_settings(blender, tmp_path, words):
+    words = [*(word.format(tmp_path / "other") for word in words), "--quality=draft"]
+    said = blender(f"""
+import json
+from bl_ext.dev.gi_volumes.operators import command
+print("CODE", command.main(["bake", *{words}]), output.exists())
+scene.gi_volumes.output_folder = "//cannot be used in an unsaved file"
+print("CODE", command.main(["bake", *{words}]))
+print("LAST", json.loads((output.parent / "other" / "argv.json").read_text())[0][-{len(words)}:])
+""")
+    assert "CODE 0 False" in said
     assert said.count("CODE 0") == 2
-    out = str(tmp_path / "out")
-    first = ["--seed", "7", "--quality", "final", "--sun", "scene", "--sky", "scene", "-o", out]
-    assert f"ARGV {first}" in said
-    second = ["-o", f"{out}/other", "--quality=draft", "--sun", "scene", "--sky", "scene", "--seed", "0"]
-    assert f"ARGV {second}" in said
+    assert f"LAST {words}" in said
 
 
 @pytest.mark.parametrize(("how", "code"), [("fail", 1), ("finish", 0)])
