@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import sys
 from pathlib import Path
 
 NEEDED = ("numpy", "embreex", "zstandard")
@@ -54,4 +55,5 @@ def complaint() -> str:
     names = missing()
     if not names:
         return ""
-    return f"Missing: {', '.join(names)}. Install the extension's zip for this platform, which brings them"
+    remedy = f'"{sys.executable}" -m pip install {" ".join(names)}'
+    return f"Missing: {', '.join(names)}. Install into Blender's Python: {remedy}"
