@@ -3,9 +3,10 @@
 from pathlib import Path
 
 import bpy
-from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
+from bpy.props import BoolProperty, EnumProperty, IntProperty, PointerProperty, StringProperty
 
-SCHEMA_VERSION = 1
+# In files of version 1 the finest voxels are a number, which Blender reads as the default, automatic.
+SCHEMA_VERSION = 2
 DEFAULT_FOLDER = "//gi_volumes/"
 
 QUALITIES = (
@@ -21,6 +22,15 @@ SUNS = (
 SKIES = (
     ("scene", "Scene", "The world of the scene, as it stands"),
     ("harmonics", "Any Sky", "The sky may change at run time; larger files"),
+)
+AUTOMATIC = "automatic"
+# The grid's levels are powers of two; scenes of another scale than people's get theirs from the automatic choice.
+FINEST = (
+    (AUTOMATIC, "Automatic", "Fits the scene; 0.5 m where people walk"),
+    *(
+        (size, f"{size} m", f"Voxels of {size} m where surfaces are near")
+        for size in ("4", "2", "1", "0.5", "0.25", "0.125")
+    ),
 )
 
 
@@ -57,13 +67,11 @@ class GIVOLUMES_PG_scene(bpy.types.PropertyGroup):
         items=SKIES,
         default="scene",
     )
-    finest: FloatProperty(
+    finest: EnumProperty(
         name="Finest Voxel",
-        description="Size of the smallest voxels, in metres; 0 (the default) fits it to the scene, 0.5 at human scale",
-        default=0.0,
-        min=0.0,
-        soft_max=2.0,
-        subtype="DISTANCE",
+        description="Size of the smallest voxels; half the size takes more time, memory and disk space",
+        items=FINEST,
+        default=AUTOMATIC,
     )
     threads: IntProperty(
         name="Threads",
@@ -154,8 +162,8 @@ def arguments(scene: bpy.types.Scene) -> dict[str, str]:
         "--sky": settings.sky,
         "--seed": str(settings.seed),
     }
-    if settings.finest:
-        options["--finest"] = f"{settings.finest:g}"
+    if settings.finest != AUTOMATIC:
+        options["--finest"] = settings.finest
     if settings.threads:
         options["--threads"] = str(settings.threads)
     return options

@@ -295,6 +295,21 @@ print("LAST", json.loads((output.parent / "other" / "argv.json").read_text())[0]
     assert f"LAST {words}" in said
 
 
+def test_every_size_of_the_finest_voxels_that_is_offered_can_be_baked(blender):
+    said = blender("""
+from bl_ext.dev.gi_volumes.operators import properties
+sizes = [item.identifier for item in scene.gi_volumes.bl_rna.properties["finest"].enum_items]
+for size in sizes:
+    scene.gi_volumes.finest = size
+    print("FINEST", size, properties.arguments(scene).get("--finest"))
+""")
+    found = [line.split()[1:] for line in said.splitlines() if line.startswith("FINEST")]
+    assert found[0] == ["automatic", "None"]
+    assert [(name, float(value)) for name, value in found[1:]] == [
+        ("4", 4), ("2", 2), ("1", 1), ("0.5", 0.5), ("0.25", 0.25), ("0.125", 0.125)
+    ]  # fmt: skip
+
+
 @pytest.mark.parametrize(("how", "code"), [("fail", 1), ("finish", 0)])
 def test_the_command_passes_the_exit_code_on(blender, how, code):
     said = blender("from bl_ext.dev.gi_volumes.operators import command\nprint('CODE', command.main(['bake']))", how)

@@ -111,7 +111,7 @@ before = ours()
 for _ in range(2):
     assert addon_utils.enable(NAME, default_set=True).__name__ == NAME
     assert "GI_VOLUMES_OT_bake" in ours() and "GIVOLUMES_PT_render" in ours() and "Scene" in ours()
-    assert bpy.context.scene.gi_volumes.schema_version == 1
+    assert bpy.context.scene.gi_volumes.schema_version == 2
     assert not bpy.data.lights[0].gi_volumes.reflector
     addon_utils.disable(NAME, default_set=True)
     assert ours() == before, ours()
@@ -129,6 +129,29 @@ bpy.ops.wm.read_homefile()
 assert bpy.context.scene.gi_volumes.quality == "preview"
 bpy.ops.wm.open_mainfile(filepath=str(output / "a.blend"))
 assert bpy.context.scene.gi_volumes.quality == "final" and bpy.data.lights[0].gi_volumes.reflector
+""")
+
+
+def test_a_finest_voxel_saved_as_a_number_is_read_as_automatic(blender):
+    blender("""
+class Old(bpy.types.PropertyGroup):
+    finest: bpy.props.FloatProperty()
+    quality: bpy.props.StringProperty()
+bpy.utils.register_class(Old)
+bpy.types.Scene.gi_volumes = bpy.props.PointerProperty(type=Old)
+bpy.context.scene.gi_volumes.finest = 0.3
+output.mkdir()
+bpy.ops.wm.save_as_mainfile(filepath=str(output / "old.blend"))
+del bpy.types.Scene.gi_volumes
+bpy.utils.unregister_class(Old)
+addon_utils.enable(NAME, default_set=True)
+bpy.ops.wm.open_mainfile(filepath=str(output / "old.blend"))
+settings = bpy.context.scene.gi_volumes
+assert settings.finest == "automatic", settings.finest
+settings.finest = "0.25"
+bpy.ops.wm.save_mainfile()
+bpy.ops.wm.open_mainfile(filepath=str(output / "old.blend"))
+assert bpy.context.scene.gi_volumes.finest == "0.25"
 """)
 
 
