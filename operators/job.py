@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
+from bpy.app.handlers import persistent
 
 from . import properties
 from .snapshot_command import one_line
@@ -225,3 +226,16 @@ def end() -> Outcome:
     last = outcome or Outcome("stopped", "Bake cancelled; finished cells are kept")
     current = None
     return last
+
+
+@persistent
+def forget(*_: object) -> None:
+    """Forget how the last job ended: another file is open.
+
+    Parameters
+    ----------
+    *_
+        What Blender tells its handlers.
+    """
+    global last
+    last = None

@@ -16,6 +16,7 @@ def register() -> None:
     """Add classes, properties and the command."""
     _register_classes()
     properties.attach()
+    bpy.app.handlers.load_post.append(job.forget)
     _commands.append(bpy.utils.register_cli_command(command.NAME, command.main))
 
 
@@ -24,6 +25,8 @@ def unregister() -> None:
     if job.current is not None:
         job.current.abandon()
         job.end()
+    if job.forget in bpy.app.handlers.load_post:
+        bpy.app.handlers.load_post.remove(job.forget)
     while _commands:
         bpy.utils.unregister_cli_command(_commands.pop())
     properties.detach()

@@ -310,6 +310,22 @@ for size in sizes:
     ]  # fmt: skip
 
 
+def test_the_panel_forgets_how_a_bake_of_another_file_ended(blender):
+    blender("""
+from bl_ext.dev.gi_volumes.operators import job
+bpy.ops.wm.save_as_mainfile(filepath=str(output.parent / "a.blend"))
+bpy.ops.gi_volumes.bake()
+assert job.last.kind == "done"
+bpy.ops.ed.undo_push()
+bpy.ops.wm.save_mainfile()
+assert job.last is not None
+for _ in range(2):  # a handler that is not persistent is gone after the first
+    bpy.ops.wm.open_mainfile(filepath=str(output.parent / "a.blend"))
+    assert job.last is None
+    job.last = job.Outcome("done", "")
+""")
+
+
 @pytest.mark.parametrize(("how", "code"), [("fail", 1), ("finish", 0)])
 def test_the_command_passes_the_exit_code_on(blender, how, code):
     said = blender("from bl_ext.dev.gi_volumes.operators import command\nprint('CODE', command.main(['bake']))", how)
