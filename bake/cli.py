@@ -22,7 +22,7 @@ from . import job, reference, snapshot_file
 from .arrays import check_output, one_line, read_points, write_array
 from .place import SNAPSHOT_NAME, check_target, scene_defects
 from .progress import Progress
-from .settings import QUALITIES, Settings, SettingsError, numbers, of_reference, unit
+from .settings import QUALITIES, Settings, SettingsError, has_free_sun, numbers, of_reference, unit
 from .snapshot import Snapshot, SnapshotError
 
 EXPECTED = (SnapshotError, SettingsError, container.FileError, OSError, ValueError, MemoryError)
@@ -267,8 +267,11 @@ def _run_query(options, extract: Extract, progress: Progress) -> dict:
 def _run_reference(options, extract: Extract, progress: Progress) -> dict:
     check_output(options.output)
     points, normals = read_points(options.points, options.normals)
-    settings = of_reference(_settings(options, options.samples, QUALITIES["final"][1]))
+    settings = _settings(options, options.samples, QUALITIES["final"][1])
+    if has_free_sun(settings.sun):
+        raise SettingsError(f"--sun {settings.sun}: the reference needs one sun; name its direction as x,y,z")
     snapshot = _read_scene(options.scene, extract, progress)
+    progress.stage("Path tracing", len(points))
     values = reference.irradiance(
         snapshot,
         points,
@@ -277,8 +280,9 @@ def _run_reference(options, extract: Extract, progress: Progress) -> dict:
         settings.samples,
         settings.bounces,
         settings.seed,
-        settings,
+        of_reference(settings),
         options.threads,
+        progress.show,
     )
     write_array(options.output, values)
     return {"points": len(points), "output": str(options.output)}
@@ -298,6 +302,7 @@ def _show_bake(result: dict) -> str:
     lines = [
         f"{result['data_points']} data points in {result['cells']} cell(s) from {result['triangles']} triangles, "
         f"{megabytes:.2f} MB, {sum(result['seconds'].values()):.1f} s, {result['rays'] / 1e6:.0f} million rays",
+        f"voxels from {result['voxels']['first']:g} m to {result['voxels']['finest']:g} m",
         f"modelled: {', '.join(result['modelled']) or 'nothing'}",
     ]
     lines += [f"left out: {item['what']}: {item['why']}" for item in result["left_out"]]

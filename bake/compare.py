@@ -20,7 +20,7 @@ from .place import SNAPSHOT_NAME, scene_defects
 from .progress import Progress
 from .rays import MISS
 from .scene import Scene, prepare
-from .settings import Settings, SettingsError, model, of_reference
+from .settings import Settings, SettingsError, from_header, model, of_reference
 from .snapshot import Camera, Snapshot
 
 LAYERS = 16
@@ -68,7 +68,7 @@ def compare(folder: Path, image: Path, view: View, progress: Progress) -> dict:
         raise SettingsError(f"{folder / defect.file}: {defect.what}")
     snapshot = snapshot_file.load(folder / SNAPSHOT_NAME)
     camera = _camera(snapshot, view.camera)
-    settings = of_reference(Settings(**baked.header["settings"]))
+    settings = of_reference(from_header(baked.header["settings"]))
     snapshot, light = model(snapshot, settings)
     progress.stage("Preparing")
     scene = prepare(snapshot, light)

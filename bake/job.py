@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from ..tree import build, folder
-from ..tree.grid import Grid
+from ..tree.grid import FIRST_SIZE, Grid
 from ..tree.topology import Topology
 from . import datapoints, snapshot_file
 from .gather import CancelledError, Effort, Gathered, gather
@@ -24,7 +24,7 @@ from .place import Place, check_target
 from .progress import Progress
 from .reference import sun_strength
 from .scene import Model, Scene, prepare, scene_suns
-from .sensors import DataPoints
+from .sensors import HarmonicsSensor
 from .settings import Settings, SettingsError, check_scene, check_triangles, choose_grid, has_free_sun, model
 from .snapshot import Snapshot
 
@@ -45,6 +45,7 @@ class Outcome:
     bytes: dict[str, int] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     rays: int = 0
+    voxels: dict[str, float] = field(default_factory=dict)
     modelled: list[str] = field(default_factory=list)
     left_out: list[dict[str, str]] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
@@ -102,6 +103,11 @@ def bake(
     header = _header(snapshot, settings, light, scene, grid, identity) | {"expected_cells": occupied}
     trees = _build_trees(scene, grid, _wanted(cells, occupied), progress)
     outcome = _describe(snapshot, light, scene, trees)
+    outcome.voxels = {"first": grid.first_size, "finest": float(grid.voxel_size(grid.levels - 1))}
+    if not settings.finest and grid.first_size != FIRST_SIZE:
+        outcome.warnings.append(
+            f"first-level voxels of {grid.first_size:g} m suit this scene's size; --finest changes it"
+        )
     place = Place(target, snapshot, header)
     try:
         _bake_cells(scene, grid, trees, place, settings, threads, progress)
@@ -178,7 +184,7 @@ def _bake_cell(scene, grid: Grid, tree: Topology, place: Place, settings: Settin
     order = rows[datapoints.morton_order(placed.position[:, rows])]
     effort = Effort(settings.samples, settings.bounces, settings.seed, threads)
     position = np.ascontiguousarray(placed.position[:, order])
-    found = gather(scene, DataPoints(), position, key[order], effort, show)
+    found = gather(scene, HarmonicsSensor(), position, key[order], effort, show)
     payloads = {name: _spread(values, order, tree.size) for name, values in _payloads(found)}
     place.write_cell(tree, payloads, placed.valid, placed.offset)
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from .gather import Effort, Gathered, gather
 from .scene import Model, Scene, prepare
-from .sensors import SurfacePoints
+from .sensors import SurfaceSensor
 from .settings import Settings, model
 from .snapshot import LightKind, Snapshot
 from .sobol import scramble
@@ -51,7 +51,7 @@ def at(
     local = np.ascontiguousarray((np.asarray(points, np.float64) - scene.origin).T.astype(np.float32))
     position = local + normal * (START * scene.tracer.offset(local, np.zeros(local.shape[1], np.float32)))
     keys = scramble(np.arange(len(points), dtype=np.uint32), 0x5EED)
-    return gather(scene, SurfacePoints(normal), position, keys, effort, progress)
+    return gather(scene, SurfaceSensor(normal), position, keys, effort, progress)
 
 
 def irradiance(
@@ -64,6 +64,7 @@ def irradiance(
     seed: int = 0,
     settings: Settings | None = None,
     threads: int = 0,
+    progress: Callable[[int], bool] | None = None,
 ) -> np.ndarray:
     """Path-trace indirect irradiance at surface points.
 
@@ -84,6 +85,8 @@ def irradiance(
         Sky and sun other than the scene's.
     threads : int
         As in `Effort`.
+    progress : callable, optional
+        As in `gather.gather`.
 
     Returns
     -------
@@ -101,7 +104,7 @@ def irradiance(
         sky=_folded(snapshot) if transport in ("sky", "all") else "none",
     )
     scene = prepare(snapshot, light)
-    found = at(scene, points, normals, Effort(samples, bounces, seed, threads))
+    found = at(scene, points, normals, Effort(samples, bounces, seed, threads), progress)
     if not (scene.has_local or len(light.suns.toward) or light.sky_count):
         return np.zeros((len(points), 3), np.float32)
     return total(snapshot, scene, found, transport)

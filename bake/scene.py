@@ -19,7 +19,7 @@ from .surfaces import Surfaces
 
 
 @dataclass(frozen=True)
-class SunKeys:
+class SunDirections:
     """Sun directions to transport.
 
     toward : (k, 3) float32, unit vectors to the sun
@@ -39,7 +39,7 @@ class Model:
     """
 
     local: bool = True
-    suns: SunKeys = field(default_factory=SunKeys)
+    suns: SunDirections = field(default_factory=SunDirections)
     sky: str = "none"
 
     @property
@@ -108,7 +108,7 @@ def prepare(snapshot: Snapshot, model: Model) -> Scene:
     )
 
 
-def scene_suns(snapshot: Snapshot) -> SunKeys:
+def scene_suns(snapshot: Snapshot) -> SunDirections:
     """The suns that the scene itself has.
 
     Parameters
@@ -118,9 +118,9 @@ def scene_suns(snapshot: Snapshot) -> SunKeys:
 
     Returns
     -------
-    SunKeys
+    SunDirections
         One key for each sun lamp that shines.
     """
     lights = snapshot.lights
     rows = np.flatnonzero((lights.kind == LightKind.SUN) & (lights.strength > 0).any(axis=1))
-    return SunKeys(np.ascontiguousarray(lights.frame[rows, :, 2]), np.ascontiguousarray(lights.size[rows, 0]))
+    return SunDirections(np.ascontiguousarray(lights.frame[rows, :, 2]), np.ascontiguousarray(lights.size[rows, 0]))

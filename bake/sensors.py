@@ -69,7 +69,7 @@ class Sensor(Protocol):
         """
 
 
-class DataPoints:
+class HarmonicsSensor:
     """Measures the nine harmonics of irradiance around points in free space."""
 
     responses = harmonics.COUNT
@@ -130,7 +130,7 @@ class DataPoints:
         return harmonics.basis(direction.T).T * harmonics.COSINE.astype(np.float32)[:, None]
 
 
-class SurfacePoints:
+class SurfaceSensor:
     """Measures irradiance on surfaces.
 
     Parameters

@@ -16,7 +16,7 @@ import numpy as np
 from ..tree import grid as lattice
 from ..tree.grid import Grid
 from ..tree.suns import MAX_KEYS
-from .scene import Model, SunKeys, scene_suns
+from .scene import Model, SunDirections, scene_suns
 from .snapshot import Snapshot, SnapshotError
 
 QUALITIES = {"draft": (64, 6), "preview": (256, 8), "final": (1024, 12)}
@@ -90,7 +90,7 @@ def with_sky(snapshot: Snapshot, sky: str) -> tuple[Snapshot, str]:
     return snapshot, "fixed" if (snapshot.sky > 0).any() else "none"
 
 
-def sun_keys(snapshot: Snapshot, sun: str) -> SunKeys:
+def sun_keys(snapshot: Snapshot, sun: str) -> SunDirections:
     """The sun directions that were asked for.
 
     Parameters
@@ -102,7 +102,7 @@ def sun_keys(snapshot: Snapshot, sun: str) -> SunKeys:
 
     Returns
     -------
-    SunKeys
+    SunDirections
         Possibly none.
 
     Raises
@@ -115,7 +115,7 @@ def sun_keys(snapshot: Snapshot, sun: str) -> SunKeys:
         _check_count(len(own.toward), sun)
         return own
     if sun == "none":
-        return SunKeys()
+        return SunDirections()
     if sun == "hemisphere":
         toward = hemisphere(HEMISPHERE_KEYS)
     elif sun.startswith("arc:"):
@@ -125,7 +125,7 @@ def sun_keys(snapshot: Snapshot, sun: str) -> SunKeys:
     _check_count(len(toward), sun)
     diameter = own.diameter[0] if len(own.diameter) else 0.0
     toward = unit(toward, f"--sun {sun}").astype(np.float32)
-    return SunKeys(toward, np.full(len(toward), diameter, np.float32))
+    return SunDirections(toward, np.full(len(toward), diameter, np.float32))
 
 
 def _check_count(count: int, sun: str) -> None:
@@ -148,6 +148,30 @@ def has_free_sun(sun: str) -> bool:
         True for a hemisphere and an arc.
     """
     return sun == "hemisphere" or sun.startswith("arc:")
+
+
+def from_header(stored: dict) -> Settings:
+    """Settings of a bake.
+
+    Parameters
+    ----------
+    stored : dict
+        What its `world.json` holds under "settings".
+
+    Returns
+    -------
+    Settings
+        The same.
+
+    Raises
+    ------
+    SettingsError
+        A newer program wrote them.
+    """
+    known = {field.name for field in dataclasses.fields(Settings)}
+    if not isinstance(stored, dict) or not set(stored) <= known:
+        raise SettingsError(f"the bake has settings that this version does not know: {sorted(set(stored) - known)}")
+    return Settings(**stored)
 
 
 def of_reference(settings: Settings) -> Settings:

@@ -11,12 +11,10 @@ from functools import cached_property
 
 import numpy as np
 
+from .gloss import layer_share
 from .snapshot import Channel, Material, Snapshot
 from .soup import Soup
 from .textures import TexturePool
-
-COSINE_NODES = 64
-"""Gauss-Legendre nodes of the average over the hemisphere; 32 already agree with 64 to 1e-7."""
 
 _SOURCES = {"r": 0, "g": 1, "b": 2, "a": 3}
 """Textures that are read as a single channel, in gray."""
@@ -43,7 +41,7 @@ class Surfaces:
         textures = tuple({c.texture: None for row in channels.values() for c in row if c.texture is not None})
         pool = TexturePool(snapshot.images, textures)
         self._channel = {name: _ChannelTable(row, textures, pool) for name, row in channels.items()}
-        self._fresnel = np.array([average_fresnel(m.ior, m.specular_level) for m in materials], np.float32)
+        self._fresnel = np.array([layer_share(m, snapshot.images) for m in materials], np.float32)
         self._cutoff = np.array([m.alpha_cutoff if m.alpha_mode == "mask" else -1 for m in materials], np.float32)
         self._opaque_alpha = np.array([m.alpha_mode == "opaque" for m in materials], bool)
         self._transmits = np.array([m.transmission.factor[0] > 0 for m in materials], bool)
@@ -68,7 +66,7 @@ class Surfaces:
         Notes
         -----
         Source: energy balance of the Principled shader's lobes: metal reflects the base colour; a dielectric
-        reflects its average Fresnel term F white, and (1 - F)(1 - transmission) of the base colour.
+        reflects the average share F of its specular layer in white, and (1 - F)(1 - transmission) of the base colour.
         """
         lanes = self._lanes(triangle, u, v)
         base, metallic, transmission = self._base_layers(lanes)
@@ -202,38 +200,6 @@ class _ChannelTable:
             picked = np.take_along_axis(rgba, np.maximum(source, 0)[None], axis=0)
             color = np.where(single, picked, color)
         return color
-
-
-def average_fresnel(ior: float, specular_level: float) -> float:
-    """Share of diffuse light that a dielectric's surface reflects.
-
-    Parameters
-    ----------
-    ior : float
-        Index of refraction, at least 1.
-    specular_level : float
-        Blender's scale of the reflectance at normal incidence; 0.5 leaves it as it is, 0 removes the layer.
-
-    Returns
-    -------
-    float
-        Cosine-weighted average of Fresnel's equations over the hemisphere.
-
-    Notes
-    -----
-    Source: Fresnel's equations for unpolarised light, integrated numerically; the level scales the reflectance at
-    normal incidence, and with it the index of refraction, the way Blender's Principled shader does.
-    """
-    root = np.sqrt(min(((ior - 1) / (ior + 1)) ** 2 * 2 * specular_level, 0.99))
-    if root == 0:
-        return 0.0
-    eta = (1 + root) / (1 - root)
-    node, weight = np.polynomial.legendre.leggauss(COSINE_NODES)
-    cosine = (node + 1) / 2
-    refracted = np.sqrt(1 - (1 - cosine**2) / eta**2)
-    across = (cosine - eta * refracted) / (cosine + eta * refracted)
-    along = (refracted - eta * cosine) / (refracted + eta * cosine)
-    return float(np.sum(weight / 2 * (across**2 + along**2) * cosine))
 
 
 def _lets_light_pass(material: Material) -> bool:

@@ -23,7 +23,7 @@ import bpy
 import numpy as np
 from gi_volumes.bake.gather import Effort, Gathered, gather
 from gi_volumes.bake.scene import Model, Scene, prepare, scene_suns
-from gi_volumes.bake.sensors import DataPoints, SurfacePoints
+from gi_volumes.bake.sensors import HarmonicsSensor, SurfaceSensor
 from gi_volumes.bake.snapshot import LightKind
 from gi_volumes.benchmarks import coincident_faces, cycles_judge, scene_edits
 from gi_volumes.benchmarks.cycles_agreement import TRANSPORTS, open_scene
@@ -168,11 +168,11 @@ class Ours:
         effort = replace(self._effort, samples=samples, seed=seed)
         start = time.perf_counter()
         if sensor == "harmonics":
-            found = gather(scene, DataPoints(), self._position, self._keys, effort)
+            found = gather(scene, HarmonicsSensor(), self._position, self._keys, effort)
         else:
             position, keys = np.repeat(self._position, 6, axis=1), np.arange(6 * len(self._keys), dtype=np.uint32)
             normals = np.tile(AXES.T, len(self._keys)).astype(np.float32)
-            found = gather(scene, SurfacePoints(normals), position, keys, effort)
+            found = gather(scene, SurfaceSensor(normals), position, keys, effort)
         seconds = time.perf_counter() - start
         names = TRANSPORTS if transport == "all" else (transport,)
         return seconds, {name: self._irradiance(scene, found, name, sensor) for name in names}

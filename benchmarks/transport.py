@@ -22,7 +22,7 @@ from gi_volumes.bake import datapoints, snapshot_file
 from gi_volumes.bake.gather import Effort, gather
 from gi_volumes.bake.rays import Tracer
 from gi_volumes.bake.scene import prepare, scene_suns
-from gi_volumes.bake.sensors import DataPoints
+from gi_volumes.bake.sensors import HarmonicsSensor
 from gi_volumes.bake.settings import Settings, model
 from gi_volumes.benchmarks.results import add_row
 
@@ -74,7 +74,7 @@ def main() -> None:
 
     def run(tracing_scene) -> float:
         start = time.process_time()
-        gather(tracing_scene, DataPoints(), position, keys, effort)
+        gather(tracing_scene, HarmonicsSensor(), position, keys, effort)
         return time.process_time() - start
 
     recorder = Recorder(scene.tracer)
@@ -98,7 +98,7 @@ def main() -> None:
 def run_threads(scene, position, keys, options, threads: int) -> float:
     """Seconds that pass while some threads do the work."""
     start = time.perf_counter()
-    gather(scene, DataPoints(), position, keys, Effort(options.samples, options.bounces, threads=threads))
+    gather(scene, HarmonicsSensor(), position, keys, Effort(options.samples, options.bounces, threads=threads))
     return time.perf_counter() - start
 
 

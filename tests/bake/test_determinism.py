@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from gi_volumes.bake import gather as gathering
 from gi_volumes.bake.gather import CancelledError, Effort, gather
-from gi_volumes.bake.scene import Model, Scene, SunKeys, prepare
-from gi_volumes.bake.sensors import DataPoints, SurfacePoints
+from gi_volumes.bake.scene import Model, Scene, SunDirections, prepare
+from gi_volumes.bake.sensors import HarmonicsSensor, SurfaceSensor
 from gi_volumes.bake.snapshot import Channel, Image, LightKind, Material, Texture
 from statistics_checks import standard_error
 
@@ -50,7 +50,7 @@ def courtyard(sky: str) -> Scene:
     uvs = rng.uniform(-1, 2, (sum(len(triangles) for triangles, _ in parts), 3, 2))
     snapshot = build_scenes.snapshot(parts, lights(), uneven, uvs=uvs, images=(image,))
     toward = np.array([[0.6, 0, 0.8], [0, 0, 1]], np.float32)
-    return prepare(snapshot, Model(suns=SunKeys(toward, np.array([0.05, 0.0], np.float32)), sky=sky))
+    return prepare(snapshot, Model(suns=SunDirections(toward, np.array([0.05, 0.0], np.float32)), sky=sky))
 
 
 def points(sensor: str) -> tuple[np.ndarray, np.ndarray, object]:
@@ -59,12 +59,14 @@ def points(sensor: str) -> tuple[np.ndarray, np.ndarray, object]:
     position = rng.uniform((-4, -4, 0.1), (4, 4, 3), (POINTS, 3)).T.astype(np.float32)
     normal = rng.normal(size=(3, POINTS)).astype(np.float32)
     normal /= np.linalg.norm(normal, axis=0)
-    made = DataPoints() if sensor == "data points" else SurfacePoints(normal)
+    made = HarmonicsSensor() if sensor == "data points" else SurfaceSensor(normal)
     return np.ascontiguousarray(position), rng.integers(0, 1 << 32, POINTS, dtype=np.uint32), made
 
 
 def some_of(sensor, rows: np.ndarray):
-    return sensor if isinstance(sensor, DataPoints) else SurfacePoints(np.ascontiguousarray(sensor._normal[:, rows]))
+    return (
+        sensor if isinstance(sensor, HarmonicsSensor) else SurfaceSensor(np.ascontiguousarray(sensor._normal[:, rows]))
+    )
 
 
 def equal(one, two, rows=slice(None)) -> bool:
@@ -164,7 +166,7 @@ def test_progress_counts_every_point_once_and_saying_no_stops_the_work(scenes, m
 
 
 def test_an_error_in_a_thread_reaches_the_caller(scenes):
-    class Broken(DataPoints):
+    class Broken(HarmonicsSensor):
         def response(self, rows, direction):
             raise RuntimeError("planted")
 
@@ -174,7 +176,9 @@ def test_an_error_in_a_thread_reaches_the_caller(scenes):
 
 
 def test_no_points_give_no_rows(scenes):
-    found = gather(scenes["fixed"], DataPoints(), np.zeros((3, 0), np.float32), np.zeros(0, np.uint32), Effort(8, 1))
+    found = gather(
+        scenes["fixed"], HarmonicsSensor(), np.zeros((3, 0), np.float32), np.zeros(0, np.uint32), Effort(8, 1)
+    )
     assert found.local.shape == (0, 9, 3)
     assert found.sun.shape == (0, 2, 9, 3)
     assert found.sky.shape == (0, 1, 9, 3)

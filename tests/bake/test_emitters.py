@@ -10,7 +10,7 @@ import pytest
 from gi_volumes.bake import warp
 from gi_volumes.bake.gather import Effort, gather
 from gi_volumes.bake.scene import Model, Scene, prepare
-from gi_volumes.bake.sensors import DataPoints, SurfacePoints
+from gi_volumes.bake.sensors import HarmonicsSensor, SurfaceSensor
 from gi_volumes.bake.snapshot import Channel, Image, Material, Texture
 from statistics_checks import SIGNIFICANCE, chi_square, is_uniform, standard_error
 
@@ -177,12 +177,12 @@ def test_light_is_the_same_with_and_without_shadow_rays_to_the_emitters_and_a_wr
     scene = prepare(build_scenes.snapshot(parts, images=images, uvs=uvs), Model())
     position = np.array([[0.3, -0.2, 0.9], [0.1, 0.5, -0.6], [0.8, 0.05, 0.3]], np.float32)
     blind = dataclasses.replace(scene, emitters=Blind())
-    for sensor in (SurfacePoints(np.array([[0, 0, 0.6], [0, 0, 0], [1, 1, 0.8]], np.float32)), DataPoints()):
+    for sensor in (SurfaceSensor(np.array([[0, 0, 0.6], [0, 0, 0], [1, 1, 0.8]], np.float32)), HarmonicsSensor()):
         with_rays = estimates(scene, sensor, position, 512)
         by_chance = estimates(blind, sensor, position, 2048)
         assert agree(with_rays, by_chance)
     planted = dataclasses.replace(scene, emitters=Overconfident(scene.emitters))
-    assert not agree(estimates(planted, DataPoints(), position, 512), by_chance)
+    assert not agree(estimates(planted, HarmonicsSensor(), position, 512), by_chance)
 
 
 def square_form_factor(side: float, height: float) -> float:
@@ -199,7 +199,7 @@ def test_a_bright_spot_that_the_power_estimate_does_not_see_still_lights_the_sce
     parts = [(build_scenes.plane(0.5, 1.0), material)]
     scene = prepare(build_scenes.snapshot(parts, uvs=uvs, images=(Image("spot", pixels),)), Model())
     assert scene.has_local
-    sensor = SurfacePoints(np.array([[0], [0], [1]], np.float32))
+    sensor = SurfaceSensor(np.array([[0], [0], [1]], np.float32))
     found = estimates(scene, sensor, np.zeros((3, 1), np.float32), 8192)[:, 0, 0]
     truth = np.pi * 1000.0 * square_form_factor(1 / 64, 1.0)
     assert abs(found.mean() - truth) < STANDARD_ERRORS * standard_error(found)
@@ -211,7 +211,7 @@ def test_clear_glass_that_emits_is_as_bright_as_a_black_panel_that_emits():
         "g", Channel((1.0,) * 3), emission=Channel((2.0,) * 3), transmission=Channel((1.0,)), specular_level=0.0
     )
     scene = prepare(build_scenes.snapshot([(build_scenes.plane(0.5, 1.0), glass)]), Model())
-    sensor = SurfacePoints(np.array([[0], [0], [1]], np.float32))
+    sensor = SurfaceSensor(np.array([[0], [0], [1]], np.float32))
     found = estimates(scene, sensor, np.zeros((3, 1), np.float32), 1024)[:, 0, 0]
     truth = np.pi * 2.0 * square_form_factor(0.5, 1.0)
     assert abs(found.mean() - truth) < STANDARD_ERRORS * standard_error(found)
@@ -219,5 +219,5 @@ def test_clear_glass_that_emits_is_as_bright_as_a_black_panel_that_emits():
 
 def test_emissive_triangles_without_area_alone_bring_no_light_and_no_nan():
     scene = prepare(build_scenes.snapshot([panels()[3], (build_scenes.plane(1.0), glow(0.0, 0.0, 0.0))]), Model())
-    found = gather(scene, DataPoints(), np.ones((3, 4), np.float32), np.arange(4, dtype=np.uint32), Effort(64, 2))
+    found = gather(scene, HarmonicsSensor(), np.ones((3, 4), np.float32), np.arange(4, dtype=np.uint32), Effort(64, 2))
     assert not found.local.any()

@@ -9,8 +9,8 @@ import build_scenes
 import numpy as np
 import pytest
 from gi_volumes.bake.gather import Effort, Gathered, gather
-from gi_volumes.bake.scene import Model, SunKeys, prepare
-from gi_volumes.bake.sensors import DataPoints, SurfacePoints
+from gi_volumes.bake.scene import Model, SunDirections, prepare
+from gi_volumes.bake.sensors import HarmonicsSensor, SurfaceSensor
 from gi_volumes.bake.settings import hemisphere
 from gi_volumes.bake.snapshot import Channel, LightKind, Material
 from statistics_checks import standard_error
@@ -36,12 +36,12 @@ def columns(*points) -> np.ndarray:
 def light(snapshot, position, model=None, sensor=None, samples=128, bounces=4, seed=0) -> Gathered:
     """Gather with numpy's complaints turned into errors, and check every value."""
     model = model or Model(sky="fixed" if snapshot.sky.any() else "none")
-    sensor = sensor or SurfacePoints(np.repeat(UP, position.shape[1], axis=1))
+    sensor = sensor or SurfaceSensor(np.repeat(UP, position.shape[1], axis=1))
     keys = np.arange(position.shape[1], dtype=np.uint32)
     found = gather(prepare(snapshot, model), sensor, position, keys, Effort(samples, bounces, seed, 1))
     for values in (found.local, found.sun, found.sky):
         assert np.isfinite(values).all()
-        assert isinstance(sensor, DataPoints) or values.min(initial=0) >= 0
+        assert isinstance(sensor, HarmonicsSensor) or values.min(initial=0) >= 0
     return found
 
 
@@ -86,8 +86,8 @@ def test_light_scales_with_its_source_over_the_range_of_float32(radiance):
 def test_a_scene_of_one_triangle_bakes_in_every_transport():
     triangle = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]], float)
     snapshot = build_scenes.snapshot([(triangle, material(0.8, 1.0))], sky=(1, 1, 1))
-    model = Model(suns=SunKeys(columns((0, 0, 1)).T, np.zeros(1, np.float32)), sky="fixed")
-    found = light(snapshot, columns((0.2, 0.2, 0.5), (0.2, 0.2, -0.5)), model, DataPoints())
+    model = Model(suns=SunDirections(columns((0, 0, 1)).T, np.zeros(1, np.float32)), sky="fixed")
+    found = light(snapshot, columns((0.2, 0.2, 0.5), (0.2, 0.2, -0.5)), model, HarmonicsSensor())
     assert found.local.any()
     assert found.sky.any()
     assert found.sun[0].any()
@@ -112,10 +112,10 @@ def test_planes_that_coincide_neither_leak_nor_lose_light():
     floors = [(build_scenes.plane(40.0), material(0.5)), (build_scenes.plane(40.0), material(0.5))]
     snapshot = build_scenes.snapshot(floors, sky=(1, 1, 1))
     found = light(
-        snapshot, columns((0, 0, -1.0), (0, 0, 1.0)), sensor=SurfacePoints(np.repeat(-UP, 2, axis=1)), bounces=1
+        snapshot, columns((0, 0, -1.0), (0, 0, 1.0)), sensor=SurfaceSensor(np.repeat(-UP, 2, axis=1)), bounces=1
     )
     assert found.sky[1, 0, 0, 0] == pytest.approx(np.pi * 0.5, rel=0.02)
-    below = SurfacePoints(np.repeat(UP, 1, axis=1))
+    below = SurfaceSensor(np.repeat(UP, 1, axis=1))
     under = light(snapshot, columns((0, 0, -1.0)), sensor=below, bounces=1).sky[0, 0, 0, 0]
     assert under == pytest.approx(np.pi * 0.5, rel=0.02)
     sheets = [
@@ -141,35 +141,35 @@ def test_a_lamp_on_in_or_behind_a_wall_stays_finite(kind, radius, height):
     parts = [(build_scenes.plane(5.0), material(0.9)), (build_scenes.box((-1, -1, -1), (1, 1, 0)), material(0.9))]
     snapshot = build_scenes.snapshot(parts, lights)
     light(snapshot, columns((0.1, 0.2, height), (0.1, 0.2, 1e-4), (3, 3, 1)), samples=64)
-    light(snapshot, columns((0.1, 0.2, height), (0.1, 0.2, 1.0)), sensor=DataPoints(), samples=64)
+    light(snapshot, columns((0.1, 0.2, height), (0.1, 0.2, 1.0)), sensor=HarmonicsSensor(), samples=64)
 
 
 def test_a_lamp_inside_a_closed_wall_lights_nothing_outside_it():
     wall = build_scenes.box((-1, -1, -1), (1, 1, 1))
     parts = [(wall, material(0.9)), (build_scenes.plane(20.0, -3.0), material(0.9))]
     snapshot = build_scenes.snapshot(parts, build_scenes.lamps({"strength": (1e4,) * 3}))
-    assert not light(snapshot, columns((3, 0, 0), (0, 2, -2.9)), sensor=DataPoints()).local.any()
+    assert not light(snapshot, columns((3, 0, 0), (0, 2, -2.9)), sensor=HarmonicsSensor()).local.any()
 
 
 def test_a_sun_below_the_horizon_lights_only_what_is_below():
     toward = np.array([[0, 0.6, -0.8], [1, 0, 0], [0, 0, 1]], np.float32)
-    model = Model(suns=SunKeys(toward, np.array([0.1, 0.5, 0.0], np.float32)))
+    model = Model(suns=SunDirections(toward, np.array([0.1, 0.5, 0.0], np.float32)))
     snapshot = build_scenes.snapshot([(build_scenes.plane(1e3), material(0.5))])
-    sensor = SurfacePoints(np.repeat(-UP, 1, axis=1))
+    sensor = SurfaceSensor(np.repeat(-UP, 1, axis=1))
     above = light(snapshot, columns((0, 0, 1.0)), model, sensor, bounces=1).sun[0, :, 0, 0]
     assert above[0] == 0
     assert above[1] < 0.05
     assert above[2] == pytest.approx(0.5, rel=1e-3)
-    below = light(snapshot, columns((0, 0, -1.0)), model, SurfacePoints(UP), bounces=1).sun[0, :, 0, 0]
+    below = light(snapshot, columns((0, 0, -1.0)), model, SurfaceSensor(UP), bounces=1).sun[0, :, 0, 0]
     assert below[0] == pytest.approx(0.4, rel=0.01)
     assert below[2] == 0
 
 
 def test_suns_all_around_add_up_to_a_white_sky():
     count = 64
-    model = Model(suns=SunKeys(hemisphere(count).astype(np.float32), np.zeros(count, np.float32)), sky="fixed")
+    model = Model(suns=SunDirections(hemisphere(count).astype(np.float32), np.zeros(count, np.float32)), sky="fixed")
     parts = [(build_scenes.plane(1e3), material(0.5)), (build_scenes.box((1, -1, 0), (2, 1, 1)), material(0.5))]
-    found = light(build_scenes.snapshot(parts, sky=(1, 1, 1)), columns((0, 0, 0.5)), model, SurfacePoints(-UP), 256, 3)
+    found = light(build_scenes.snapshot(parts, sky=(1, 1, 1)), columns((0, 0, 0.5)), model, SurfaceSensor(-UP), 256, 3)
     by_suns = found.sun[0, :, 0, 0].sum() * 2 * np.pi / count
     assert by_suns == pytest.approx(found.sky[0, 0, 0, 0], rel=0.03)
 
@@ -179,7 +179,7 @@ def test_ninety_panes_of_glass_end_paths_and_shadow_rays_without_an_error():
     panes = [(build_scenes.plane(50.0, 0.1 * k), glass) for k in range(1, 91)]
     lights = build_scenes.lamps({"position": (0, 0, 12.0), "strength": (100,) * 3})
     snapshot = build_scenes.snapshot([(build_scenes.plane(50.0), material(0.5)), *panes], lights, (1, 1, 1))
-    model = Model(suns=SunKeys(UP.T, np.zeros(1, np.float32)), sky="fixed")
+    model = Model(suns=SunDirections(UP.T, np.zeros(1, np.float32)), sky="fixed")
     light(snapshot, columns((0, 0, 0.05)), model, samples=32, bounces=2)
 
 
@@ -202,4 +202,4 @@ def test_nothing_is_said_on_the_way():
     snapshot = build_scenes.snapshot([(room, material(1.0, 0.0)), (room + 1, material(0.0, 1e-6))], lights)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        light(snapshot, columns((1, 1, 1), (0, 0, 0), (2, 2, 2)), sensor=DataPoints())
+        light(snapshot, columns((1, 1, 1), (0, 0, 0), (2, 2, 2)), sensor=HarmonicsSensor())

@@ -8,7 +8,7 @@ import pytest
 from gi_volumes.bake.gather import Effort, gather
 from gi_volumes.bake.lamps import NEAREST, Lamps
 from gi_volumes.bake.scene import Model, prepare
-from gi_volumes.bake.sensors import SurfacePoints
+from gi_volumes.bake.sensors import SurfaceSensor
 from gi_volumes.bake.snapshot import Channel, LightKind, Material
 from statistics_checks import SIGNIFICANCE, chi_square, standard_error
 
@@ -125,7 +125,7 @@ def under_a_roof(*rows: dict) -> np.ndarray:
     gray = Material("ground", Channel((0.5,) * 3), specular_level=0.0)
     parts = [(build_scenes.plane(50.0), gray), (build_scenes.plane(50.0, 2.0), black)]
     scene = prepare(build_scenes.snapshot(parts, build_scenes.lamps(*rows)), Model())
-    sensor = SurfacePoints(columns((0, 0, -1)))
+    sensor = SurfaceSensor(columns((0, 0, -1)))
     found = gather(scene, sensor, columns((0, 0, 1.0)), np.zeros(1, np.uint32), Effort(1024, 1, 0, 1))
     return found.local[0, 0]
 
@@ -148,7 +148,7 @@ def test_a_reflector_s_own_light_needs_a_free_way_only_when_it_casts_shadows():
         )
         black = Material("roof", Channel((0.0,) * 3), specular_level=0.0)
         scene = prepare(build_scenes.snapshot([(roof, black)], lights), Model())
-        sensor = SurfacePoints(columns((0, 0, 1)))
+        sensor = SurfaceSensor(columns((0, 0, 1)))
         found = gather(scene, sensor, columns((0, 0, 0)), np.zeros(1, np.uint32), Effort(64, 1, 0, 1)).local[0, 0]
         assert np.allclose(found, truth, rtol=1e-4)
 

@@ -7,9 +7,10 @@ import dataclasses
 import build_scenes
 import numpy as np
 import pytest
+from gi_volumes.bake.gloss import average_fresnel, layer_share, rough_share
 from gi_volumes.bake.snapshot import Channel, Image, Material, Snapshot, Texture
 from gi_volumes.bake.soup import flatten
-from gi_volumes.bake.surfaces import Surfaces, average_fresnel
+from gi_volumes.bake.surfaces import Surfaces
 
 ROUNDING = 5e-7
 """Energies are sums of a few rounded float32 products near one."""
@@ -113,7 +114,7 @@ def test_glass_without_a_specular_layer_passes_its_base_colour_and_reflects_noth
 
 
 def test_a_specular_layer_adds_its_fresnel_share_in_white_and_takes_it_from_what_is_below():
-    share = average_fresnel(1.5, 0.5)
+    share = rough_share(1.5, 0.5, 0.5)
     base = np.array([0.8, 0.4, 0.0])
     reflected = evaluate(Material("p", Channel(tuple(base))))[0]
     assert np.allclose(reflected, share + (1 - share) * base, atol=ROUNDING)
@@ -141,10 +142,55 @@ def test_the_average_fresnel_share_is_the_integral_of_fresnel_s_equations(ior):
     assert average_fresnel(ior, 0.5) < average_fresnel(ior, 1.0) < 1
 
 
+@pytest.mark.parametrize("ior", [1.05, 1.5, 2.4])
+def test_a_nearly_smooth_layer_has_the_share_of_a_smooth_one_and_rougher_ones_have_less(ior):
+    shares = [rough_share(ior, 0.5, roughness) for roughness in (0.05, 0.3, 0.5, 0.8, 1.0)]
+    assert shares[0] == pytest.approx(average_fresnel(ior, 0.5), rel=0.01)
+    assert all(np.diff(shares) < 0)
+
+
+def rough_share_by_chance(ior: float, roughness: float, count: int = 400_000) -> float:
+    """Part of diffuse light that facets (GGX, Smith) reflect once: lobe times cosines over both hemispheres."""
+    generator = np.random.default_rng(5)
+    z_in, z_out = np.sqrt(generator.random((2, count)))
+    angle = 2 * np.pi * generator.random(count)
+    to, out = (
+        np.stack([np.sqrt(1 - z**2) * np.cos(a), np.sqrt(1 - z**2) * np.sin(a), z])
+        for z, a in ((z_in, 0 * angle), (z_out, angle))
+    )
+    half = (to + out) / np.sqrt(((to + out) ** 2).sum(axis=0))
+    width = roughness**4
+    facets = width / (np.pi * (half[2] ** 2 * (width - 1) + 1) ** 2)
+    hidden = [(np.sqrt(1 + width * (1 / z**2 - 1)) - 1) / 2 for z in (z_in, z_out)]
+    cosine = (to * half).sum(axis=0)
+    inside = np.sqrt(1 - (1 - cosine**2) / ior**2)
+    across = (cosine - ior * inside) / (cosine + ior * inside)
+    along = (ior * cosine - inside) / (ior * cosine + inside)
+    lobe = (across**2 + along**2) / 2 * facets / (1 + hidden[0] + hidden[1]) / (4 * z_in * z_out)
+    return float(np.mean(np.pi * lobe))
+
+
+@pytest.mark.parametrize("roughness", [0.6, 0.8, 1.0])
+def test_the_share_of_a_rough_layer_is_the_integral_of_its_lobe(roughness):
+    share = rough_share(1.5, 0.5, roughness)
+    assert share == pytest.approx(rough_share_by_chance(1.5, roughness), rel=0.01, abs=1.5e-3)
+    assert share != pytest.approx(average_fresnel(1.5, 0.5), rel=0.05)
+
+
+def test_a_layer_whose_roughness_is_a_texture_has_the_mean_share_of_its_texels():
+    pixels = np.zeros((2, 2, 4), np.uint8)
+    pixels[..., 1] = [[0, 255], [255, 255]]
+    rough = Channel((1.0,), Texture(0, channel="g"))
+    found = layer_share(Material("m", roughness=rough), (Image("i", pixels, "linear"),))
+    expected = 0.25 * average_fresnel(1.5, 0.5) + 0.75 * rough_share(1.5, 0.5, 1.0)
+    assert found == pytest.approx(expected, rel=1e-6)
+
+
 def test_extreme_indices_of_refraction_and_levels_stay_between_nothing_and_everything():
     for ior in (0.0, 0.5, 1.0, 1.0 + 1e-9, 1000.0):
         for level in (0.0, 0.5, 1.0, 1e6):
             assert 0 <= average_fresnel(ior, level) < 1
+            assert 0 <= rough_share(ior, level, 0.5) < 1
 
 
 @pytest.mark.parametrize(
