@@ -37,13 +37,13 @@ endif
 	$(RUN_52) $(INSTALL)
 	@touch $@
 
-$(DEMO)/courtyard.blend: $(wildcard demo/*.py) | setup
+$(DEMO)/courtyard.blend: $(wildcard demo/*.py) | .venv/.installed
 	@mkdir -p $(DEMO)
 	$(RUN) demo/courtyard.py $@
 
-bake: setup $(DEMO)/courtyard.blend
+bake: .venv/.installed $(DEMO)/courtyard.blend
 	$(RUN) -m gi_volumes bake $(DEMO)/courtyard.blend -o $(DEMO)/bake
-	$(RUN) -m gi_volumes compare $(DEMO)/bake -o $(DEMO)/compare.png
+	$(RUN) -m gi_volumes compare $(DEMO)/bake -o $(DEMO)/compare.png --size 400x225 --samples 64
 	@echo "The bake is in $(DEMO)/bake; baked, path-traced and their difference are in $(DEMO)/compare.png"
 
 lint: setup

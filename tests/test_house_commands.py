@@ -159,3 +159,29 @@ def test_a_python_without_bpy_says_what_to_do(repository, tmp_path):
     assert done.returncode == 1
     assert done.stderr.startswith("error: scene.blend: reading a .blend file needs Blender's Python module")
     assert done.stderr.count("\n") == 1
+
+
+@pytest.fixture
+def recipe(repository):
+    """What `make` would run for a target, were nothing there yet."""
+    if shutil.which("make") is None:
+        pytest.skip("there is no make")
+
+    def ask(target: str, python_52: str) -> str:
+        done = run("make", "--dry-run", "--always-make", target, f"PYTHON_52={python_52}", cwd=repository)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    return ask
+
+
+def test_the_demo_needs_no_second_blender(recipe):
+    assert ".venv-5.2" in recipe("test", "python3.13")
+    commands = recipe("bake", "python3.13")
+    assert ".venv-5.2" not in commands
+    assert "gi_volumes bake" in commands
+
+
+def test_tests_without_a_second_blender_say_so(recipe):
+    assert "SKIPPED: no Python 3.13" in recipe("test", "")
+    assert "SKIPPED" not in recipe("test", "python3.13")
