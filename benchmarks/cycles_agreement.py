@@ -1,8 +1,8 @@
 """Compares our path-traced reference with Cycles, transport by transport, on surface points of a scene.
 
     python benchmarks/cycles_agreement.py SCENE [--points N] [--samples S] [--paths P] [--bounces B]
-                                          [--transports sky,sun,local] [--materials diffuse|original]
-                                          [--keep-coincident] [--bright] [--worst K]
+                                          [--transports sky,sun,local] [--keep-coincident] [--bright] [--worst K]
+                                          [--materials diffuse|smooth|filtered|original]
 
 Comes in: a .blend, .glb or .gltf file; what lacks a sky or a sun gets one. Goes out: a line for each transport, and
 a row of agreement.csv. With diffuse materials Cycles models what we model, so that the difference has to be noise;
@@ -25,6 +25,9 @@ from gi_volumes.benchmarks.results import commit
 
 RESULTS = Path(__file__).with_name("agreement.csv")
 TRANSPORTS = ("sky", "sun", "local")
+MATERIALS = ("diffuse", "smooth", "filtered", "original")
+"""What Cycles gets: what the bake models, that with smooth normals or with filtered textures, or everything."""
+
 SKY_RADIANCE, SUN_IRRADIANCE = 1.0, 4.0
 SUN_TILT = (math.radians(38), 0.0, math.radians(-35))
 """Turns a sun that shines down: high enough to reach into courts and windows."""
@@ -254,7 +257,7 @@ class Plan:
     paths : of ours for each point and seed
     bounces : reflections
     seed : of the choice of points; light has its own
-    materials : "diffuse" (what the bake models) or "original"
+    materials : one of `MATERIALS`
     against : "ours", or "cycles": the judge against itself
     keep_coincident : whether faces that lie in others stay in the scene
     bright : whether points are chosen by how much light arrives, not by area alone
@@ -312,8 +315,8 @@ def compare(plan: Plan, transports: Iterable[str] = TRANSPORTS) -> Iterator[Comp
     # Ours read the scene before the judge's edits.
     pilot, ours = our_estimator(PILOT_PATHS, plan.bounces), our_estimator(plan.paths, plan.bounces)
     judge = cycles_estimator(plan.samples, plan.bounces)
-    if plan.materials == "diffuse":
-        scene_edits.make_diffuse()
+    if plan.materials != "original":
+        scene_edits.make_diffuse(smooth=plan.materials == "smooth", filtered=plan.materials == "filtered")
     seeds, others = (tuple(range(first, first + SEEDS)) for first in (FIRST_SEED, FIRST_SEED + SEEDS))
     for transport in transports:
         points, normals = candidates
@@ -362,7 +365,7 @@ def _parse() -> argparse.Namespace:
         ("seed", "of the choice of points"),
     ):
         parser.add_argument(f"--{name}", type=int, default=getattr(Plan, name), help=help)
-    parser.add_argument("--materials", choices=("diffuse", "original"), default="diffuse")
+    parser.add_argument("--materials", choices=MATERIALS, default="diffuse")
     parser.add_argument(
         "--against", choices=("ours", "cycles"), default="ours", help="cycles: the judge against itself"
     )

@@ -6,17 +6,19 @@ taken back when its block ends, `make_diffuse` stays until the file is closed.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from typing import Any, Self
 
 import bpy
 import numpy as np
 
+from ..bake import gloss
+
 TRANSPARENT_SHADERS = frozenset({"ShaderNodeBsdfGlass", "ShaderNodeBsdfRefraction"})
 DIFFUSE_SHADERS = frozenset(
     {"ShaderNodeBsdfAnisotropic", "ShaderNodeBsdfGlossy", "ShaderNodeBsdfMetallic", "ShaderNodeBsdfTranslucent"}
 )
+LAYER_POINTS = 33
 EMISSION_INPUTS = {"ShaderNodeBsdfPrincipled": "Emission Strength", "ShaderNodeEmission": "Strength"}
 
 
@@ -151,19 +153,30 @@ def material_trees() -> Iterator[bpy.types.NodeTree]:
     yield from (group for group in bpy.data.node_groups if group.bl_idname == "ShaderNodeTree")
 
 
-def make_diffuse() -> None:
+def make_diffuse(smooth: bool = False, filtered: bool = False) -> None:
     """Replace the shaders of all materials by what the bake models.
 
-    Reflection becomes diffuse: the base colour, under a dielectric's layer that reflects its average Fresnel term
-    in white; transmission goes straight through, tinted by the base colour; emission and alpha stay. Normal maps,
-    smooth normals, coat, sheen and subsurface scattering are gone.
+    Reflection becomes diffuse: the base colour, under a dielectric's layer that reflects its average share in white,
+    which depends on roughness; transmission goes straight through, tinted by the base colour; emission and alpha
+    stay. Normal maps, coat, sheen and subsurface scattering are gone.
+
+    Parameters
+    ----------
+    smooth : bool
+        Keep smooth normals, which move light; the bake has those of triangles.
+    filtered : bool
+        Keep the filter of textures. Cycles filters sRGB bytes before it decodes them, which is darker than the mean
+        of what it decodes; the bake reads the closest texel.
     """
     for item in bpy.data.objects:
-        # Moves the shadow rays of smooth faces.
-        item.shadow_terminator_geometry_offset = 0.0
+        if not smooth:
+            # Moves the shadow rays of smooth faces.
+            item.shadow_terminator_geometry_offset = 0.0
     for tree in material_trees():
         for node in list(tree.nodes):
-            if node.bl_idname == "ShaderNodeBsdfPrincipled":
+            if node.bl_idname == "ShaderNodeTexImage" and not filtered:
+                node.interpolation = "Closest"
+            elif node.bl_idname == "ShaderNodeBsdfPrincipled":
                 _replace(tree, node, _principled_as_diffuse(tree, node))
             elif node.bl_idname in DIFFUSE_SHADERS:
                 colour = next(s for s in node.inputs if s.type == "RGBA")
@@ -172,35 +185,16 @@ def make_diffuse() -> None:
                 _replace(tree, node, _diffuse(tree, node.inputs["Color"]))
             elif node.bl_idname in TRANSPARENT_SHADERS:
                 _replace(tree, node, _shader(tree, "ShaderNodeBsdfTransparent", Color=node.inputs["Color"]))
+        if not smooth:
+            _flatten(tree)
 
 
-def average_fresnel(ior: float, specular_level: float) -> float:
-    """Integrate the reflectance of a dielectric over the hemisphere.
-
-    Parameters
-    ----------
-    ior : float
-        Index of refraction.
-    specular_level : float
-        Principled's: scales the reflectance at normal incidence by twice itself, by way of the index.
-
-    Returns
-    -------
-    float
-        Cosine-weighted average of Fresnel's equations for unpolarised light.
-
-    Notes
-    -----
-    Error: 1e-4, from the midpoint rule.
-    """
-    root = math.sqrt(min(((ior - 1) / (ior + 1)) ** 2 * 2 * specular_level, 0.99))
-    index = (1 + root) / (1 - root)
-    cosine_squared = (np.arange(4096) + 0.5) / 4096
-    cosine = np.sqrt(cosine_squared)
-    refracted = np.sqrt(1 - (1 - cosine_squared) / index**2)
-    across = (cosine - index * refracted) / (cosine + index * refracted)
-    along = (index * cosine - refracted) / (index * cosine + refracted)
-    return float((across**2 + along**2).mean() / 2)
+def _flatten(tree: bpy.types.NodeTree) -> None:
+    """Give diffuse shaders the normals of triangles."""
+    shaders = [node for node in tree.nodes if node.bl_idname == "ShaderNodeBsdfDiffuse"]
+    geometry = tree.nodes.new("ShaderNodeNewGeometry")
+    for shader in shaders:
+        tree.links.new(geometry.outputs["True Normal"], shader.inputs["Normal"])
 
 
 def _principled_as_diffuse(tree: bpy.types.NodeTree, node: bpy.types.Node) -> bpy.types.NodeSocket:
@@ -211,8 +205,7 @@ def _principled_as_diffuse(tree: bpy.types.NodeTree, node: bpy.types.Node) -> bp
     if _varies(inputs["Transmission Weight"], 0.0):
         straight = _shader(tree, "ShaderNodeBsdfTransparent", Color=colour)
         surface = _mix(tree, inputs["Transmission Weight"], surface, straight)
-    fresnel = average_fresnel(inputs["IOR"].default_value, inputs["Specular IOR Level"].default_value)
-    surface = _mix(tree, fresnel, surface, _diffuse(tree))
+    surface = _mix(tree, _layer(tree, inputs), surface, _diffuse(tree))
     if _varies(inputs["Metallic"], 0.0):
         surface = _mix(tree, inputs["Metallic"], surface, base)
     if _varies(inputs["Emission Strength"], 0.0):
@@ -231,13 +224,29 @@ def _principled_as_diffuse(tree: bpy.types.NodeTree, node: bpy.types.Node) -> bp
     return surface
 
 
+def _layer(tree: bpy.types.NodeTree, inputs: bpy.types.bpy_prop_collection) -> bpy.types.NodeSocket:
+    """Share of light that the specular layer reflects, as a curve over roughness."""
+    node = tree.nodes.new("ShaderNodeFloatCurve")
+    _feed(tree, inputs["Roughness"], node.inputs["Value"])
+    node.mapping.use_clip = False
+    curve = node.mapping.curves[0]
+    ior, level = inputs["IOR"].default_value, inputs["Specular IOR Level"].default_value
+    points = [(0.0, gloss.average_fresnel(ior, level))]
+    points += [(x, gloss.rough_share(ior, level, x)) for x in np.linspace(0, 1, LAYER_POINTS)[1:]]
+    for _ in range(len(points) - len(curve.points)):
+        curve.points.new(0.5, 0.5)
+    for point, location in zip(curve.points, points, strict=True):
+        point.location, point.handle_type = location, "VECTOR"
+    node.mapping.update()
+    return node.outputs[0]
+
+
 def _diffuse(tree: bpy.types.NodeTree, colour: bpy.types.NodeSocket | None = None) -> bpy.types.NodeSocket:
-    """Output of a new diffuse surface with the normals of its triangles, white unless a colour is given."""
-    shader, geometry = tree.nodes.new("ShaderNodeBsdfDiffuse"), tree.nodes.new("ShaderNodeNewGeometry")
+    """Output of a new diffuse surface, white unless a colour is given."""
+    shader = tree.nodes.new("ShaderNodeBsdfDiffuse")
     shader.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
     if colour is not None:
         _feed(tree, colour, shader.inputs["Color"])
-    tree.links.new(geometry.outputs["True Normal"], shader.inputs["Normal"])
     return shader.outputs[0]
 
 
@@ -255,23 +264,22 @@ def _shader(tree: bpy.types.NodeTree, kind: str, **inputs: bpy.types.NodeSocket)
 
 
 def _mix(
-    tree: bpy.types.NodeTree, factor: bpy.types.NodeSocket | float, *shaders: bpy.types.NodeSocket
+    tree: bpy.types.NodeTree, factor: bpy.types.NodeSocket, *shaders: bpy.types.NodeSocket
 ) -> bpy.types.NodeSocket:
     """Output of a new mix: the first shader at factor 0, the second at factor 1."""
     node = tree.nodes.new("ShaderNodeMixShader")
-    if isinstance(factor, float):
-        node.inputs[0].default_value = factor
-    else:
-        _feed(tree, factor, node.inputs[0])
+    _feed(tree, factor, node.inputs[0])
     for index, shader in enumerate(shaders, start=1):
         tree.links.new(shader, node.inputs[index])
     return node.outputs[0]
 
 
 def _feed(tree: bpy.types.NodeTree, source: bpy.types.NodeSocket, target: bpy.types.NodeSocket) -> None:
-    """Give `target` the link or the value of `source`."""
+    """Give `target` the link or the value of an input, or a link from an output."""
     target.default_value = source.default_value
-    if source.is_linked:
+    if source.is_output:
+        tree.links.new(source, target)
+    elif source.is_linked:
         tree.links.new(source.links[0].from_socket, target)
 
 

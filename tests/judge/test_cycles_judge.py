@@ -9,6 +9,7 @@ import pytest
 
 bpy = pytest.importorskip("bpy", reason="Cycles comes with the bpy wheel")
 
+from gi_volumes.bake import gloss  # noqa: E402
 from gi_volumes.benchmarks import cycles_judge, scene_edits  # noqa: E402
 from gi_volumes.benchmarks.cycles_judge import Settings, irradiance  # noqa: E402
 
@@ -213,19 +214,30 @@ def test_materials_made_diffuse_reflect_base_colour_and_fresnel_and_keep_alpha(m
     material = add_floor(400.0, -2.0, albedo=0.5)
     shader = next(node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED")
     shader.inputs["Metallic"].default_value = metallic
+    shader.inputs["Roughness"].default_value = 0.8
     shader.inputs["Specular IOR Level"].default_value = 0.5
     shader.inputs["Alpha"].default_value = 0.75
     add_lamp("SUN", 1.0)
     scene_edits.make_diffuse()
-    fresnel = (1 - metallic) * scene_edits.average_fresnel(1.5, 0.5)
+    fresnel = (1 - metallic) * gloss.rough_share(1.5, 0.5, 0.8)
     measured = irradiance(*facing(-UP), "sun", Settings(samples=256)).mean.mean()
     assert measured == pytest.approx(0.75 * (0.5 + 0.5 * fresnel), rel=0.004)
 
 
-def test_the_average_fresnel_term_is_the_tabulated_one():
+@pytest.mark.parametrize("roughness", [0.05, 0.3, 0.5, 0.8, 1.0])
+def test_the_layer_of_a_black_dielectric_reflects_in_cycles_the_share_that_the_bake_gives_it(roughness):
+    add_world(1.0)
+    material = add_floor(400.0, -2.0, albedo=0.0)
+    shader = next(node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED")
+    shader.inputs["Specular IOR Level"].default_value = 0.5
+    shader.inputs["Roughness"].default_value = roughness
+    measured = irradiance(*facing(-UP), "sky", Settings(samples=128, bounces=1)).mean.mean() / math.pi
+    assert measured == pytest.approx(gloss.rough_share(1.5, 0.5, roughness), abs=1e-3)
+
+
+def test_the_share_of_a_smooth_layer_is_the_tabulated_one():
     # Internal reflection apart, a dielectric of index 1.5 reflects 9.18 % of diffuse light.
-    assert scene_edits.average_fresnel(1.5, 0.5) == pytest.approx(0.0918, abs=1e-4)
-    assert scene_edits.average_fresnel(1.5, 0.0) == 0.0
+    assert gloss.average_fresnel(1.5, 0.5) == pytest.approx(0.0918, abs=1e-4)
 
 
 @pytest.mark.parametrize(
