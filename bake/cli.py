@@ -258,6 +258,9 @@ def _run_query(options, extract: Extract, progress: Progress) -> dict:
     if options.sun is not None:
         direction = unit(numbers(options.sun, "--sun", (3,))[None], f"--sun {options.sun}")[0]
     loaded = world.load(options.folder)
+    expected = len(loaded.header.get("expected_cells", loaded.cells))
+    if len(loaded.cells) < expected:
+        print(f"warning: {expected - len(loaded.cells)} of {expected} cells are not baked yet", file=sys.stderr)
     sun = None if direction is None else (direction, loaded.sun_irradiance)
     values = loaded.irradiance(points, normals, sun=sun, transport=options.transport)
     write_array(options.output, values)
