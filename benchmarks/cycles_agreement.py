@@ -2,7 +2,7 @@
 
     python benchmarks/cycles_agreement.py SCENE [--points N] [--samples S] [--paths P] [--bounces B]
                                           [--transports sky,sun,local] [--keep-coincident] [--bright] [--worst K]
-                                          [--materials diffuse|smooth|filtered|original]
+                                          [--materials diffuse|smooth|filtered|clear|original]
 
 Comes in: a .blend, .glb or .gltf file; what lacks a sky or a sun gets one. Goes out: a line for each transport, and
 a row of agreement.csv. With diffuse materials Cycles models what we model, so that the difference has to be noise;
@@ -25,8 +25,9 @@ from gi_volumes.benchmarks.results import commit
 
 RESULTS = Path(__file__).with_name("agreement.csv")
 TRANSPORTS = ("sky", "sun", "local")
-MATERIALS = ("diffuse", "smooth", "filtered", "original")
-"""What Cycles gets: what the bake models, that with smooth normals or with filtered textures, or everything."""
+MATERIALS = ("diffuse", "smooth", "filtered", "clear", "original")
+"""What Cycles gets: what the bake models, that with smooth normals or with filtered textures, everything but glass
+that refracts, or everything."""
 
 SKY_RADIANCE, SUN_IRRADIANCE = 1.0, 4.0
 SUN_TILT = (math.radians(38), 0.0, math.radians(-35))
@@ -316,7 +317,7 @@ def compare(plan: Plan, transports: Iterable[str] = TRANSPORTS) -> Iterator[Comp
     pilot, ours = our_estimator(PILOT_PATHS, plan.bounces), our_estimator(plan.paths, plan.bounces)
     judge = cycles_estimator(plan.samples, plan.bounces)
     if plan.materials != "original":
-        scene_edits.make_diffuse(smooth=plan.materials == "smooth", filtered=plan.materials == "filtered")
+        scene_edits.make_diffuse(*(plan.materials == kept for kept in ("smooth", "filtered", "clear")))
     seeds, others = (tuple(range(first, first + SEEDS)) for first in (FIRST_SEED, FIRST_SEED + SEEDS))
     for transport in transports:
         points, normals = candidates

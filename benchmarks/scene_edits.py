@@ -153,7 +153,7 @@ def material_trees() -> Iterator[bpy.types.NodeTree]:
     yield from (group for group in bpy.data.node_groups if group.bl_idname == "ShaderNodeTree")
 
 
-def make_diffuse(smooth: bool = False, filtered: bool = False) -> None:
+def make_diffuse(smooth: bool = False, filtered: bool = False, only_glass: bool = False) -> None:
     """Replace the shaders of all materials by what the bake models.
 
     Reflection becomes diffuse: the base colour, under a dielectric's layer that reflects its average share in white,
@@ -167,12 +167,16 @@ def make_diffuse(smooth: bool = False, filtered: bool = False) -> None:
     filtered : bool
         Keep the filter of textures. Cycles filters sRGB bytes before it decodes them, which is darker than the mean
         of what it decodes; the bake reads the closest texel.
+    only_glass : bool
+        Leave materials without transmission as they are.
     """
     for item in bpy.data.objects:
-        if not smooth:
+        if not (smooth or only_glass):
             # Moves the shadow rays of smooth faces.
             item.shadow_terminator_geometry_offset = 0.0
     for tree in material_trees():
+        if only_glass and not _is_glass(tree):
+            continue
         for node in list(tree.nodes):
             if node.bl_idname == "ShaderNodeTexImage" and not filtered:
                 node.interpolation = "Closest"
@@ -187,6 +191,14 @@ def make_diffuse(smooth: bool = False, filtered: bool = False) -> None:
                 _replace(tree, node, _shader(tree, "ShaderNodeBsdfTransparent", Color=node.inputs["Color"]))
         if not smooth:
             _flatten(tree)
+
+
+def _is_glass(tree: bpy.types.NodeTree) -> bool:
+    """Whether any shader of a material transmits."""
+    principled = (node for node in tree.nodes if node.bl_idname == "ShaderNodeBsdfPrincipled")
+    return any(_varies(node.inputs["Transmission Weight"], 0.0) for node in principled) or any(
+        node.bl_idname in TRANSPARENT_SHADERS for node in tree.nodes
+    )
 
 
 def _flatten(tree: bpy.types.NodeTree) -> None:
