@@ -46,7 +46,9 @@ def load(folder: Path | str) -> World:
     Raises
     ------
     FileError
-        A file is missing, damaged or of a newer version; the message names file, offset and reason.
+        A file is damaged or of a newer version; the message names file, offset and reason.
+    OSError
+        A file is missing or cannot be read.
     """
     from .tree.world import load as load_world
 

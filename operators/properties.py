@@ -7,7 +7,7 @@ from bpy.props import BoolProperty, EnumProperty, IntProperty, PointerProperty, 
 
 # In files of version 1 the finest voxels are a number, which Blender reads as the default, automatic.
 SCHEMA_VERSION = 2
-DEFAULT_FOLDER = "//gi_volumes/"
+DEFAULT_FOLDER = "//gi_bake/"
 
 QUALITIES = (
     ("draft", "Draft", "Seconds to minutes; grainy, for checking the set-up"),

@@ -155,7 +155,7 @@ print(repr(failure(bpy.ops.gi_volumes.bake)), output.exists())
 @pytest.mark.parametrize(
     ("folder", "remedy"),
     [
-        ("//gi_volumes/", "save the .blend first"),
+        ("//gi_bake/", "save the .blend first"),
         ("", "set one in Render Properties"),
         ("somewhere", "neither absolute nor relative to the .blend file"),
     ],
