@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import os
 import signal
 import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import NoReturn
 
 PACKAGE = "gi_volumes"
 ROOT = Path(__file__).resolve().parent
@@ -109,7 +111,16 @@ def _stop_like_ctrl_c() -> None:
             signal.signal(getattr(signal, name), signal.default_int_handler)
 
 
+def _leave(code: int) -> NoReturn:
+    """End the process; one that holds Blender without its clean-up, which was seen to wait for ever after a render."""
+    if "bpy" in sys.modules:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)
+
+
 if __name__ == "__main__":
     _stop_like_ctrl_c()
     importlib.import_module(".operators.worker", package().__name__).stop_with_parent()
-    sys.exit(main(sys.argv[1:]))
+    _leave(main(sys.argv[1:]))

@@ -75,7 +75,7 @@ def test_an_artist_bakes_in_the_window_cancels_and_bakes_to_the_end(blender, arc
         ["escape", "stopped"],
         ["cancel", "stopped"],
         ["disable", "alive"],
-        ["another file", "stopped"],
+        ["another file", "forgotten"],
     ]
     assert {"Reading the scene", "Baking", "Stopping"} <= set(seen["progress"])
     assert "data points" in seen["message"]
