@@ -102,7 +102,7 @@ def test_the_command_line_inside_blender_bakes_the_loaded_file(blender, archive,
     assert code == 0, said
     code, said = blender(*command, "bake", "--quality", "draft")
     assert code == 0, said
-    assert (tmp_path / "gi_volumes" / "world.json").is_file()
+    assert (tmp_path / "gi_bake" / "world.json").is_file()
     code, said = blender(*command, "bake", "missing.blend")
     assert (code, "error: missing.blend: no such file" in said) == (1, True), said
     assert blender(*command, "dance")[0] == 2
