@@ -7,13 +7,11 @@ reflects; the rest goes to what is below. A rough layer has half of a smooth one
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 
-from .snapshot import Channel, Image, Material
-from .textures import TexturePool
+from .snapshot import Material
 
 COSINE_NODES = 64
 """Gauss-Legendre nodes of the average over the hemisphere; 32 already agree with 64 to 1e-7."""
@@ -24,29 +22,22 @@ ROUGHNESS = np.linspace(0.0, 1.0, 17)
 FACETS = 32
 """Facets in each of two dimensions, for each of as many directions; more change the share by less than 5e-4."""
 
-TEXELS = 64
-"""Roughness of a textured material is read at so many places along both edges of its image."""
 
-SINGLE = {"r": 0, "g": 1, "b": 2, "a": 3}
-
-
-def layer_share(material: Material, images: tuple[Image, ...]) -> float:
-    """Average what a material's specular layer reflects.
+def layer_shares(materials: tuple[Material, ...]) -> np.ndarray:
+    """Tabulate what the specular layers of materials reflect.
 
     Parameters
     ----------
-    material : Material
-        Its roughness may be a texture: its mean share then stands for all of the surface.
-    images : tuple of Image
-        Of the snapshot.
+    materials : tuple of Material
+        Any.
 
     Returns
     -------
-    float
-        Of diffuse light, in [0, 1).
+    (m, r) float32 ndarray
+        Share of diffuse light, in [0, 1), for each roughness of `ROUGHNESS`; between them it is to be interpolated.
     """
-    shares = _shares(material.ior, material.specular_level)
-    return float(np.interp(_roughness(material.roughness, images), ROUGHNESS, shares).mean())
+    rows = [_shares(material.ior, material.specular_level) for material in materials]
+    return np.array(rows, np.float32).reshape(-1, len(ROUGHNESS))
 
 
 def rough_share(ior: float, specular_level: float, roughness: float) -> float:
@@ -159,16 +150,3 @@ def _visible_facets(cosine: np.ndarray, u1: np.ndarray, u2: np.ndarray, width: f
     up = np.sqrt(np.maximum(1 - across**2 - along**2, 0))
     normal = np.stack([width * (x * up - z * along), width * across, np.maximum(x * along + z * up, 1e-9)])
     return normal / np.sqrt((normal**2).sum(axis=0))
-
-
-def _roughness(channel: Channel, images: tuple[Image, ...]) -> np.ndarray:
-    """Values over a surface, in [0, 1]; one if they are all the same."""
-    factor = float(channel.factor[0])
-    if channel.texture is None:
-        return np.clip(np.array([factor]), 0, 1)
-    texture = replace(channel.texture, uv_from_mesh=(1.0, 0.0, 0.0, 0.0, 1.0, 0.0))
-    place = (np.arange(TEXELS) + 0.5) / TEXELS
-    uv = np.stack([axis.ravel() for axis in np.meshgrid(place, place)]).astype(np.float32)
-    rgba = TexturePool(images, (texture,)).sample(np.zeros(TEXELS**2, np.int64), uv)
-    value = rgba[SINGLE[texture.channel]] if texture.channel in SINGLE else rgba[:3].mean(axis=0)
-    return np.clip(np.nan_to_num(value.astype(np.float64)) * factor, 0, 1)

@@ -6,13 +6,13 @@ specular layer's energy is kept, its direction is not, as in every irradiance vo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
-from .gloss import layer_share
-from .snapshot import Channel, Material, Snapshot
+from .gloss import ROUGHNESS, layer_shares
+from .snapshot import Channel, Material, Snapshot, Texture
 from .soup import Soup
 from .textures import TexturePool
 
@@ -36,12 +36,12 @@ class Surfaces:
         self.material = geometry.materials[soup.source]
         self._uvs = _corner_values(geometry.corner_uvs, soup)
         self._colors = _corner_values(geometry.corner_colors, soup)
-        names = ("base_color", "emission", "alpha", "metallic", "transmission")
+        names = ("base_color", "emission", "alpha", "metallic", "transmission", "roughness")
         channels = {name: [getattr(material, name) for material in materials] for name in names}
-        textures = tuple({c.texture: None for row in channels.values() for c in row if c.texture is not None})
-        pool = TexturePool(snapshot.images, textures)
-        self._channel = {name: _ChannelTable(row, textures, pool) for name, row in channels.items()}
-        self._fresnel = np.array([layer_share(m, snapshot.images) for m in materials], np.float32)
+        textures = tuple({_whole(c.texture): None for row in channels.values() for c in row if c.texture is not None})
+        self._pool = TexturePool(snapshot.images, textures)
+        self._channel = {name: _ChannelTable(row, textures) for name, row in channels.items()}
+        self._shares = layer_shares(materials)
         self._cutoff = np.array([m.alpha_cutoff if m.alpha_mode == "mask" else -1 for m in materials], np.float32)
         self._opaque_alpha = np.array([m.alpha_mode == "opaque" for m in materials], bool)
         self._transmits = np.array([m.transmission.factor[0] > 0 for m in materials], bool)
@@ -66,13 +66,14 @@ class Surfaces:
         Notes
         -----
         Source: energy balance of the Principled shader's lobes: metal reflects the base colour; a dielectric
-        reflects the average share F of its specular layer in white, and (1 - F)(1 - transmission) of the base colour.
+        reflects the share F of its specular layer, averaged over directions, in white, and
+        (1 - F)(1 - transmission) of the base colour.
         """
         lanes = self._lanes(triangle, u, v)
         base, metallic, transmission = self._base_layers(lanes)
-        fresnel = self._fresnel[lanes.material]
-        diffuse = metallic + (1 - metallic) * (1 - fresnel) * (1 - transmission)
-        return np.minimum(base * diffuse + (1 - metallic) * fresnel, 1)
+        layer = self._layer(lanes)
+        diffuse = metallic + (1 - metallic) * (1 - layer) * (1 - transmission)
+        return np.minimum(base * diffuse + (1 - metallic) * layer, 1)
 
     def through(self, triangle: np.ndarray, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Light that goes straight on, and how much of the surface is there.
@@ -98,7 +99,7 @@ class Surfaces:
         if len(rows):
             clear = self._lanes(triangle[rows], u[rows], v[rows])
             base, metallic, transmission = self._base_layers(clear)
-            share = covered[rows] * (1 - metallic) * (1 - self._fresnel[clear.material]) * transmission
+            share = covered[rows] * (1 - metallic) * (1 - self._layer(clear)) * transmission
             passed[:, rows] += share * base
         return np.minimum(passed, 1), covered
 
@@ -130,6 +131,14 @@ class Surfaces:
         transmission = np.minimum(self._evaluate("transmission", lanes)[0], 1)
         return base, metallic, transmission
 
+    def _layer(self, lanes: _Lanes) -> np.ndarray:
+        """(n,) share of light that the specular layer reflects, at the roughness of each hit."""
+        place = np.minimum(self._evaluate("roughness", lanes)[0], 1) * np.float32(len(ROUGHNESS) - 1)
+        below = np.minimum(place.astype(np.int64), len(ROUGHNESS) - 2)
+        row = lanes.material * len(ROUGHNESS) + below
+        first, second = self._shares.ravel()[row], self._shares.ravel()[row + 1]
+        return first + (second - first) * (place - below)
+
     def _coverage(self, lanes: _Lanes) -> np.ndarray:
         """Alpha after the material's mode: opaque, cut, or as it is."""
         alpha = np.minimum(self._evaluate("alpha", lanes)[0], 1)
@@ -142,11 +151,11 @@ class Surfaces:
         table = self._channel[name]
         value = table.factor[:, lanes.material]
         if table.has_texture:
-            rows = np.flatnonzero(table.texture[lanes.material] >= 0)
+            rows, rgba = self._texels(table, lanes)
             if len(rows) == len(lanes.material):
-                value *= table.sample(lanes.material, lanes.uv)
+                value *= table.pick(lanes.material, rgba)
             elif len(rows):
-                value[:, rows] *= table.sample(lanes.material[rows], lanes.uv[:, rows])
+                value[:, rows] *= table.pick(lanes.material[rows], rgba)
         if table.has_color:
             rows = np.flatnonzero(table.color[lanes.material])
             rgba = lanes.color[:, rows]
@@ -155,10 +164,20 @@ class Surfaces:
             np.maximum(value, 0, out=value)
         return value
 
+    def _texels(self, table: _ChannelTable, lanes: _Lanes) -> tuple[np.ndarray, np.ndarray]:
+        """Rows (m,) of the lanes that have a texture there, and its RGBA (4, m), which several channels may share."""
+        if table.images not in lanes.texels:
+            texture = table.texture[lanes.material]
+            rows = np.flatnonzero(texture >= 0)
+            every = len(rows) == len(texture)
+            rgba = self._pool.sample(texture if every else texture[rows], lanes.uv if every else lanes.uv[:, rows])
+            lanes.texels[table.images] = rows, rgba
+        return lanes.texels[table.images]
+
 
 @dataclass
 class _Lanes:
-    """Hits, and their attributes, interpolated when the first channel asks and kept for the others."""
+    """Hits, and their attributes, interpolated or read when the first channel asks and kept for the others."""
 
     material: np.ndarray
     triangle: np.ndarray
@@ -166,6 +185,7 @@ class _Lanes:
     v: np.ndarray
     uvs: np.ndarray
     colors: np.ndarray
+    texels: dict[bytes, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
 
     @cached_property
     def uv(self) -> np.ndarray:
@@ -181,18 +201,18 @@ class _Lanes:
 class _ChannelTable:
     """One input of every material, as arrays over materials."""
 
-    def __init__(self, channels: list[Channel], textures: tuple, pool: TexturePool) -> None:
+    def __init__(self, channels: list[Channel], textures: tuple) -> None:
         self.factor = np.ascontiguousarray(np.array([c.factor for c in channels], np.float32).T)
-        self.texture = np.array([-1 if c.texture is None else textures.index(c.texture) for c in channels], np.int64)
+        rows = [-1 if c.texture is None else textures.index(_whole(c.texture)) for c in channels]
+        self.texture = np.array(rows, np.int64)
+        self.images = self.texture.tobytes()
         self.color = np.array([c.vertex_color for c in channels], bool)
         self.has_texture = bool((self.texture >= 0).any())
         self.has_color = bool(self.color.any())
         self._source = np.array([_SOURCES.get(c.texture.channel, -1) if c.texture else -1 for c in channels])
-        self._pool = pool
 
-    def sample(self, material: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    def pick(self, material: np.ndarray, rgba: np.ndarray) -> np.ndarray:
         """(k, n) texture values in the channel that each material asks for."""
-        rgba = self._pool.sample(self.texture[material], uv)
         color = rgba[:3] if len(self.factor) == 3 else rgba[:3].mean(axis=0, keepdims=True)
         source = self._source[material]
         single = source >= 0
@@ -200,6 +220,11 @@ class _ChannelTable:
             picked = np.take_along_axis(rgba, np.maximum(source, 0)[None], axis=0)
             color = np.where(single, picked, color)
         return color
+
+
+def _whole(texture: Texture) -> Texture:
+    """The texture with all its channels: inputs that read different ones share its texels."""
+    return replace(texture, channel="rgb")
 
 
 def _lets_light_pass(material: Material) -> bool:
