@@ -170,10 +170,8 @@ def make_diffuse(smooth: bool = False, filtered: bool = False, only_glass: bool 
     only_glass : bool
         Leave materials without transmission as they are.
     """
-    for item in bpy.data.objects:
-        if not (smooth or only_glass):
-            # Moves the shadow rays of smooth faces.
-            item.shadow_terminator_geometry_offset = 0.0
+    if not (smooth or only_glass):
+        _flatten()
     for tree in material_trees():
         if only_glass and not _is_glass(tree):
             continue
@@ -189,8 +187,6 @@ def make_diffuse(smooth: bool = False, filtered: bool = False, only_glass: bool 
                 _replace(tree, node, _diffuse(tree, node.inputs["Color"]))
             elif node.bl_idname in TRANSPARENT_SHADERS:
                 _replace(tree, node, _shader(tree, "ShaderNodeBsdfTransparent", Color=node.inputs["Color"]))
-        if not smooth:
-            _flatten(tree)
 
 
 def _is_glass(tree: bpy.types.NodeTree) -> bool:
@@ -201,12 +197,16 @@ def _is_glass(tree: bpy.types.NodeTree) -> bool:
     )
 
 
-def _flatten(tree: bpy.types.NodeTree) -> None:
-    """Give diffuse shaders the normals of triangles."""
-    shaders = [node for node in tree.nodes if node.bl_idname == "ShaderNodeBsdfDiffuse"]
-    geometry = tree.nodes.new("ShaderNodeNewGeometry")
-    for shader in shaders:
-        tree.links.new(geometry.outputs["True Normal"], shader.inputs["Normal"])
+def _flatten() -> None:
+    """Give all meshes the normals of their triangles. A shader's own normal is no way: Cycles darkens what has one."""
+    for mesh in bpy.data.meshes:
+        custom = mesh.attributes.get("custom_normal")
+        if custom is not None:
+            mesh.attributes.remove(custom)
+        mesh.shade_flat()
+    for item in bpy.data.objects:
+        # Moves the shadow rays of smooth faces.
+        item.shadow_terminator_geometry_offset = 0.0
 
 
 def _principled_as_diffuse(tree: bpy.types.NodeTree, node: bpy.types.Node) -> bpy.types.NodeSocket:
