@@ -1,37 +1,39 @@
 """Chooses the data points that light a point, and their weights.
 
-Comes in: points, normals, the data points of all cells. Goes out: eight rows and weights a point, which sum to 1.
-On the finest level with usable data, the eight voxel centres around the point count by trilinear weight times the
-cosine between the normal and the direction to the data point. Where no level has such data the cosine is dropped;
-where there are no valid centres either, the nearest valid data point of the first level counts alone.
+Comes in: points, normals, the data points of all cells. Goes out: rows and weights. Each tap of the stencil counts by
+
+    weight = linear weight * valid * max(0, cosine between the normal and the way to it) * what its planes let through
+
+and irradiance is the mean by these weights. Where they sum to too little, coarser levels fill up the rest
+(`blend`). All of it is continuous along surfaces, and rooms stay apart behind their walls.
 """
 
 from __future__ import annotations
 
-import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from .cells import OFFSET_STEPS
+from .dualcells import CORNERS, DualCells
 from .grid import Grid
 from .lookup import Atlas
+from .stencil import Taps, taps
+from .topology import Topology
 
-__all__ = ["DataPoints", "weigh"]
+__all__ = ["PLANES", "DataPoints", "join", "layers", "weigh"]
 
-CORNERS = np.array([corner[::-1] for corner in itertools.product((0, 1), repeat=3)], np.int64)
-"""Offsets of the eight voxels around a point, x fastest."""
-USABLE = 1e-6
-"""Weights that sum to less carry no information: rounding of points that lie in a data point's own plane."""
-AT_POINT = 1e-6
-"""Distance in voxel sizes within which a point is at the data point, where no direction exists."""
-FAR = 2.0**36
-"""Points are clamped to this many first-level voxels, so that coordinates of all levels fit into int64."""
-PAIRS = 1 << 22
-"""Distances computed at a time."""
+PLANES = 3
+"""Occluding planes of a data point."""
+NEAR = 1e-3
+"""Distance in voxel sizes within which the cosine fades to 1, as no direction exists at the data point itself."""
+ANY = np.float32(1e9)
+"""Added height that makes every direction count alike."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DataPoints:
     """The data points of a bake, over the global index space of its atlas.
 
@@ -41,29 +43,140 @@ class DataPoints:
         The lattice.
     atlas : Atlas
         The trees.
+    level : (n,) uint8
+        Level of each voxel.
+    coords : (n, 3) int64
+        Its global coordinates.
     offset : (n, 3) int8
         Data point minus voxel centre, in voxel sizes / 254.
     valid : (n,) bool
         Whether there is a data point.
-    first_level : (m,) int64
-        Global indices of the valid voxels of the first level.
-    first_center : (m, 3) float64
-        Their centres, relative to the origin [m].
+    planes : (n, 3) int32
+        Rows of `plane`, -1 for none.
+    plane : (m, 5) float64
+        Unit normal, distance along it from the origin [m], width [m]: what is farther than the width behind a plane
+        does not see the data points that use it.
     boxes : (cells, 2, 3) float64
         Lowest and highest corner of each cell's dense grid, relative to the origin [m].
     """
 
     grid: Grid
     atlas: Atlas
+    level: np.ndarray
+    coords: np.ndarray
     offset: np.ndarray
     valid: np.ndarray
-    first_level: np.ndarray
-    first_center: np.ndarray
+    planes: np.ndarray
+    plane: np.ndarray
     boxes: np.ndarray
+
+    @cached_property
+    def size(self) -> np.ndarray:
+        """(n,) float64 voxel size of each data point [m]."""
+        return np.asarray(self.grid.voxel_size(self.level.astype(np.int64)), np.float64)
+
+    @cached_property
+    def position(self) -> np.ndarray:
+        """(n, 3) float64 data points, relative to the origin [m]."""
+        return (self.coords + 0.5 + self.offset / OFFSET_STEPS) * self.size[:, None]
+
+    @cached_property
+    def dual_cells(self) -> list[DualCells]:
+        """Look-up of the dual cells of each level."""
+        rows = [np.flatnonzero(self.level == level) for level in range(self.grid.levels)]
+        return [DualCells(self.coords[row], row) for row in rows]
+
+    @cached_property
+    def shift(self) -> np.ndarray:
+        """(3, n) float32 offsets [voxels]."""
+        return np.ascontiguousarray(self.offset.T.astype(np.float32) / np.float32(OFFSET_STEPS))
+
+    @cached_property
+    def has_planes(self) -> np.ndarray:
+        """(n,) bool."""
+        return (self.planes >= 0).any(axis=1)
+
+    @cached_property
+    def first_level(self) -> np.ndarray:
+        """(f,) int64 rows of the valid voxels of the first level."""
+        return np.flatnonzero((self.level == 0) & self.valid)
+
+
+def join(
+    grid: Grid,
+    topologies: Sequence[Topology],
+    offset: np.ndarray,
+    valid: np.ndarray,
+    planes: np.ndarray | None = None,
+    plane: np.ndarray | None = None,
+) -> DataPoints:
+    """Join the data points of some cells, which may be one.
+
+    Parameters
+    ----------
+    grid : Grid
+        The lattice.
+    topologies : sequence of Topology
+        The trees, each cell once.
+    offset : (n, 3) int8
+        Of all cells, in their order.
+    valid : (n,) bool
+        Likewise.
+    planes : (n, 3) int32, optional
+        Rows of `plane`, -1 for none; no planes at all when left out.
+    plane : (m, 5) float64, optional
+        As in `DataPoints`.
+
+    Returns
+    -------
+    DataPoints
+        Ready for look-up.
+    """
+    voxels = [topology.voxels() for topology in topologies]
+    level = np.concatenate([np.zeros(0, np.uint8), *(voxel[0] for voxel in voxels)])
+    coords = np.concatenate([np.zeros((0, 3), np.int64), *(voxel[1] for voxel in voxels)])
+    low = np.array([t.grid_min for t in topologies], np.float64).reshape(-1, 3)
+    high = low + np.array([t.grid_shape for t in topologies], np.float64).reshape(-1, 3)
+    planes = np.full((len(level), PLANES), -1, np.int32) if planes is None else planes
+    plane = np.zeros((0, 5)) if plane is None else plane
+    boxes = np.stack([low, high], axis=1) * grid.first_size
+    return DataPoints(grid, Atlas(topologies), level, coords, offset, valid, planes, plane, boxes)
+
+
+def layers(data: DataPoints, points: np.ndarray, normals: np.ndarray, finest: int | None = None) -> Iterator[Taps]:
+    """Weigh the taps of a stencil: `Taps.weight` holds the products, which are not normalised.
+
+    Parameters
+    ----------
+    data : DataPoints
+        The bake.
+    points : (3, n) float64
+        Relative to the origin [m].
+    normals : (3, n) float32
+        Unit length, or zero where no surface is meant: then all directions count alike.
+    finest : int, optional
+        Level to start from.
+
+    Yields
+    ------
+    Taps
+        From fine to coarse.
+
+    Notes
+    -----
+    Source: the talk's rows 9 and 10; occluding planes are ours.
+    """
+    start = data.grid.levels - 1 if finest is None else finest
+    for found in taps(data.grid, data.dual_cells, points, start):
+        weight = found.weight
+        weight *= data.valid[found.row]
+        _face(data, found, normals if len(found.point) == points.shape[1] else normals[:, found.point])
+        _occlude(data, found, points)
+        yield found
 
 
 def weigh(data: DataPoints, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the data points that light each point.
+    """Return the data points that light each point, as far as they are trusted.
 
     Parameters
     ----------
@@ -71,91 +184,58 @@ def weigh(data: DataPoints, points: np.ndarray, normals: np.ndarray) -> tuple[np
         The bake.
     points : (n, 3) float64
         Relative to the origin [m].
-    normals : (n, 3) float64
-        Unit length, or zero where no surface is meant: then all directions count alike.
+    normals : (n, 3) float
+        Unit length, or zero where no surface is meant.
 
     Returns
     -------
-    row : (n, 8) int64
-        Global indices of valid voxels; 0 where the weight is 0.
-    weight : (n, 8) float64
-        Sum 1; all 0 only in a bake without any valid data point.
+    row : (n, k) int64
+        Rows of data points, 0 where the weight is 0; k is 8 for each level that some point needs, 16 in a bake.
+    weight : (n, k) float32
+        Not normalised. Where a row sums to less than `blend.ENOUGH`, the value is filled up from coarser levels.
     """
-    row, weight = np.zeros((len(points), 8), np.int64), np.zeros((len(points), 8))
-    if not data.valid.any():
-        return row, weight
-    limit = FAR * data.grid.first_size
-    points = np.clip(points, -limit, limit)
-    left = np.arange(len(points))
-    for facing, level in itertools.product((True, False), range(data.grid.levels - 1, -1, -1)):
-        if not len(left):
-            return row, weight
-        found, part = _neighbourhood(data, level, points[left], normals[left] if facing else None)
-        total = part.sum(axis=1)
-        usable = total > USABLE
-        row[left[usable]], weight[left[usable]] = found[usable], part[usable] / total[usable, None]
-        left = left[~usable]
-    nearest = _nearest(data, points[left])
-    row[left[nearest >= 0], 0], weight[left[nearest >= 0], 0] = nearest[nearest >= 0], 1.0
+    points, normals = np.ascontiguousarray(points.T), np.ascontiguousarray(normals.T.astype(np.float32))
+    used = np.zeros(points.shape[1], np.int64)
+    found = list(layers(data, points, normals))
+    for part in found:
+        used[part.point] += 1
+    width = 8 * int(used.max(initial=1))
+    row, weight = np.zeros((len(used), width), np.int64), np.zeros((len(used), width), np.float32)
+    used[:] = 0
+    for part in found:
+        columns = used[part.point, None] * 8 + np.arange(8)
+        row[part.point[:, None], columns] = np.where(part.weight > 0, part.row, 0).T
+        weight[part.point[:, None], columns] = part.weight.T
+        used[part.point] += 1
     return row, weight
 
 
-def _neighbourhood(
-    data: DataPoints, level: int, points: np.ndarray, normals: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Valid ones of the eight voxels around each point, and trilinear weights, times the cosine if asked for."""
-    size = float(data.grid.voxel_size(level))
-    base = np.floor(points / size - 0.5)
-    place = points / size - 0.5 - base
-    coords = base.astype(np.int64)[:, None] + CORNERS
-    row = data.atlas.find(level, coords.reshape(-1, 3)).reshape(-1, 8)
-    valid = (row >= 0) & data.valid[row]
-    row = np.where(valid, row, 0)
-    weight = np.where(valid, np.where(CORNERS, place[:, None], 1.0 - place[:, None]).prod(axis=2), 0.0)
-    if normals is not None:
-        weight[valid] *= _cosines(data, size, coords, row, points, normals)[valid]
-    return row, weight
+def _face(data: DataPoints, found: Taps, normals: np.ndarray) -> None:
+    """Multiply weights with the cosine between the normal and the way to the data point, 0 behind the surface."""
+    lift = np.where(normals.any(axis=0), np.float32(NEAR), ANY)
+    for corner in range(8):
+        row = found.row[corner]
+        height, squared = lift.copy(), np.full(len(row), NEAR * NEAR, np.float32)
+        for axis in range(3):
+            arm = data.shift[axis][row]
+            arm += np.float32(CORNERS[corner, axis])
+            arm -= found.place[axis]
+            height += normals[axis] * arm
+            squared += arm * arm
+        height /= np.sqrt(squared)
+        found.weight[corner] *= np.clip(height, 0, 1, out=height)
 
 
-def _cosines(
-    data: DataPoints, size: float, coords: np.ndarray, row: np.ndarray, points: np.ndarray, normals: np.ndarray
-) -> np.ndarray:
-    """Cosine between the normal and the direction to each data point, 0 behind the surface."""
-    step = size / OFFSET_STEPS
-    arm = (coords + 0.5) * size + data.offset[row] * step - points[:, None]
-    length = np.sqrt(np.einsum("nci,nci->nc", arm, arm))
-    cosine = np.einsum("nci,ni->nc", arm, normals) / np.maximum(length, AT_POINT * size)
-    free = (length < AT_POINT * size) | ~normals.any(axis=1)[:, None]
-    return np.where(free, 1.0, np.maximum(cosine, 0.0))
-
-
-def _nearest(data: DataPoints, points: np.ndarray) -> np.ndarray:
-    """Valid voxel of the first level whose centre is nearest to the point clamped to the nearest dense grid."""
-    if not len(data.first_level):
-        return np.full(len(points), -1)
-    size = data.grid.first_size
-    clamped = _clamp(data.boxes, points)
-    voxels, inverse = np.unique(np.floor(clamped / size), axis=0, return_inverse=True)
-    nearest = np.empty(len(voxels), np.int64)
-    step = max(1, PAIRS // len(data.first_level))
-    for start in range(0, len(voxels), step):
-        center = (voxels[start : start + step] + 0.5) * size
-        nearest[start : start + step] = _squared(center, data.first_center).argmin(axis=1)
-    return data.first_level[nearest[inverse.reshape(-1)]]
-
-
-def _clamp(boxes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """The nearest point of the nearest box."""
-    clamped = np.empty_like(points)
-    step = max(1, PAIRS // max(len(boxes), 1))
-    for start in range(0, len(points), step):
-        part = points[start : start + step]
-        inside = np.clip(part[:, None], boxes[:, 0], boxes[:, 1])
-        best = ((inside - part[:, None]) ** 2).sum(axis=2).argmin(axis=1)
-        clamped[start : start + step] = inside[np.arange(len(part)), best]
-    return clamped
-
-
-def _squared(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Squared distances between all rows of two arrays."""
-    return sum((a[:, None, axis] - b[None, :, axis]) ** 2 for axis in range(3))
+def _occlude(data: DataPoints, found: Taps, points: np.ndarray) -> None:
+    """Multiply weights with what the data points' planes let through."""
+    corner, column = np.nonzero(data.has_planes[found.row] & (found.weight > 0))
+    if not len(corner):
+        return
+    planes, at = data.planes[found.row[corner, column]], points[:, found.point[column]]
+    seen = np.ones(len(corner))
+    for number in range(PLANES):
+        some = np.flatnonzero(planes[:, number] >= 0)
+        plane = data.plane[planes[some, number]].T
+        behind = sum(plane[axis] * at[axis, some] for axis in range(3)) - plane[3]
+        seen[some] *= np.clip(1.0 + behind / plane[4], 0.0, 1.0)
+    found.weight[corner, column] *= seen.astype(np.float32)

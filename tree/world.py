@@ -9,15 +9,15 @@ three terms is clamped at 0 by itself, so that they add up whether they are aske
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from . import folder, harmonics, payload
+from .blend import blend, clamp
 from .container import FileError
 from .grid import Grid
-from .interpolate import DataPoints, weigh
+from .interpolate import DataPoints, join
 from .lookup import Atlas
 from .suns import SunKeys
 
@@ -26,8 +26,10 @@ __all__ = ["TRANSPORTS", "World", "load"]
 TRANSPORTS = ("all", "local", "sun", "sky")
 FIXED_SUN = np.radians(1.0)
 """How far from a baked direction a fixed sun may be asked for [rad]: two disks of the sun."""
-CHUNK = 1 << 15
-"""Points handled at a time: about 100 MB of temporaries."""
+CHUNK = 1 << 14
+"""Points handled at a time: their temporaries stay in the cache of a core."""
+REMEMBERED = 4
+"""Combinations of transports, sun and sky whose coefficients are kept for the next look-up."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,7 @@ class World:
         self._values = {name: _join(name, cells, self._data.atlas) for name in names}
         sun = header.get("transports", {}).get("sun") or {}
         self._keys = SunKeys(np.array(sun["directions"])) if sun.get("directions") else None
+        self._remembered: dict[tuple, np.ndarray] = {}
         self._sun_is_free = bool(sun.get("free", True))
         own = sun.get("scene") or []
         self._own_direction = np.array([entry["direction"] for entry in own], np.float64).reshape(-1, 3)
@@ -131,22 +134,35 @@ class World:
         points, normals = _check_rows(points, "points"), _unit(_check_rows(normals, "normals"))
         if len(points) != len(normals):
             raise ValueError(f"{len(points)} points and {len(normals)} normals; as many are needed")
-        factors = self._factors(sun, sky, transport)
+        values = self._folded(self._factors(sun, sky, transport))
         result = np.zeros((len(points), 3), np.float32)
         for start in range(0, len(points), CHUNK):
             part = slice(start, start + CHUNK)
-            result[part] = self._evaluate(self.grid.to_local(points[part]), normals[part], factors)
+            result[part] = self._evaluate(clamp(self._data, self.grid.to_local(points[part])), normals[part], values)
         return result
 
-    def _evaluate(self, points: np.ndarray, normals: np.ndarray, factors: dict[str, np.ndarray]) -> np.ndarray:
-        """One chunk: weights once, then each transport."""
-        row, weight = weigh(self._data, points, normals)
-        functions = harmonics.basis(normals)
+    def _evaluate(self, points: np.ndarray, normals: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """One chunk: the mean coefficients of all transports at once, then each along the normals."""
+        functions = harmonics.basis(normals).astype(np.float32)
         functions[~normals.any(axis=1), 1:] = 0.0
+        mean = blend(self._data, values, points, normals)
         total = np.zeros((len(points), 3), np.float32)
-        for name, factor in factors.items():
-            total += np.maximum(_sum(self._values[name], factor, row, weight, functions), 0.0)
+        for first in range(0, mean.shape[1], 27):
+            part = np.zeros((len(points), 3), np.float32)
+            for number in range(9):
+                part += functions[:, number, None] * mean[:, first + 3 * number : first + 3 * number + 3]
+            total += np.maximum(part, 0.0)
         return np.minimum(total, np.finfo(np.float32).max)
+
+    def _folded(self, factors: dict[str, np.ndarray]) -> np.ndarray:
+        """(rows, 27 for each transport) float32 coefficients of all voxels, for these suns and this sky."""
+        key = tuple((name, factor.tobytes()) for name, factor in factors.items())
+        if key not in self._remembered:
+            while len(self._remembered) >= REMEMBERED:
+                self._remembered.pop(next(iter(self._remembered)))
+            parts = [_fold(self._values[name], factor) for name, factor in factors.items()]
+            self._remembered[key] = np.concatenate([np.zeros((len(self._data.valid), 0), np.float32), *parts], axis=1)
+        return self._remembered[key]
 
     def _factors(self, sun: tuple | None, sky: np.ndarray | float | None, transport: str) -> dict[str, np.ndarray]:
         """(K, 3) factors of the functions of each transport that counts."""
@@ -243,19 +259,9 @@ def load(path: str | os.PathLike) -> World:
 
 def _data_points(grid: Grid, cells: list[folder.Cell]) -> DataPoints:
     """Join the data points of all cells."""
-    topologies = [cell.topology for cell in cells]
-    atlas = Atlas(topologies)
     offset = np.concatenate([np.zeros((0, 3), np.int8), *(cell.offset for cell in cells)])
     valid = np.concatenate([np.zeros(0, bool), *(cell.valid for cell in cells)])
-    low = np.array([t.grid_min for t in topologies], np.float64).reshape(-1, 3)
-    high = low + np.array([t.grid_shape for t in topologies], np.float64).reshape(-1, 3)
-    rows, centers = [np.zeros(0, np.int64)], [np.zeros((0, 3))]
-    for cell, first in zip(cells, atlas.first[:-1], strict=True):
-        kept = np.flatnonzero(cell.valid[: cell.topology.grid_count])
-        rows.append(kept + first)
-        centers.append((cell.topology.voxels()[1][kept] + 0.5) * grid.first_size)
-    boxes = np.stack([low, high], axis=1) * grid.first_size
-    return DataPoints(grid, atlas, offset, valid, np.concatenate(rows), np.concatenate(centers), boxes)
+    return join(grid, [cell.topology for cell in cells], offset, valid)
 
 
 def _join(name: str, cells: list[folder.Cell], atlas: Atlas) -> Values:
@@ -273,26 +279,13 @@ def _join(name: str, cells: list[folder.Cell], atlas: Atlas) -> Values:
     return Values(entry, np.concatenate([p.table for p in present]), scale)
 
 
-def _sum(values: Values, factor: np.ndarray, row: np.ndarray, weight: np.ndarray, functions: np.ndarray) -> np.ndarray:
-    """(n, 3) weighted sum over data points, functions and harmonics; entries are unpacked once each."""
-    entry = values.entry[row]
-    used, place = np.unique(np.where((entry >= 0) & (weight > 0), entry, -1), return_inverse=True)
-    place = place.reshape(row.shape)
-    coefficients = np.zeros((len(used), 9 * 3), np.float32)
-    for part in _unpack(values, factor, used[used >= 0]):
-        coefficients[used >= 0] += part
-    sums = np.zeros((len(row), 27), np.float32)
-    weight = weight.astype(np.float32)
-    for corner in range(8):
-        sums += weight[:, corner, None] * coefficients[place[:, corner]]
-    return np.einsum("nk,nkc->nc", functions, sums.reshape(-1, 9, 3))
-
-
-def _unpack(values: Values, factor: np.ndarray, entries: np.ndarray) -> Iterator[np.ndarray]:
-    """(m, 27) float32 share of each function that counts."""
+def _fold(values: Values, factor: np.ndarray) -> np.ndarray:
+    """(rows, 27) float32 sum over functions of factor times coefficients; zeros where there is no data."""
+    table = np.zeros((len(values.table) + 1, 9, 3), np.float32)
     for function in np.flatnonzero(factor.any(axis=1)):
-        table = values.table[entries, function].astype(np.float64) * values.scale[entries, None, None]
-        yield (table * factor[function]).reshape(-1, 27).astype(np.float32)
+        unpacked = values.table[:, function].astype(np.float64) * values.scale[:, None, None]
+        table[:-1] += (unpacked * factor[function]).astype(np.float32)
+    return table.reshape(-1, 27)[values.entry]
 
 
 def _check_rows(values: np.ndarray, what: str) -> np.ndarray:
