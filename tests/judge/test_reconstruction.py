@@ -17,7 +17,7 @@ from gi_volumes.benchmarks import dense_grid, errors, receivers, reconstruction
 ROOM = ((0.1, 0.1, 0.1), (6.9, 5.9, 4.9))
 """No wall on a border of voxels, where data points come to lie in it."""
 
-PLAN = reconstruction.Plan(points=300, samples=2048, data_samples=2048)
+PLAN = reconstruction.Plan(points=300, samples=512, data_samples=512)
 NOTHING = 0.015
 """Errors of a constant field, relative to it: what is left of its noise."""
 
@@ -35,9 +35,9 @@ def noisy(truth: np.ndarray, noise: float, seed: int) -> np.ndarray:
 @pytest.fixture(scope="module")
 def furnace(tmp_path_factory) -> reconstruction.Bake:
     """A baked closed room whose walls shine: the same light at every point in every direction."""
-    room = build_scenes.snapshot([(build_scenes.box(*ROOM, inward=True), matte(0.3, 1.0))])
+    room = build_scenes.snapshot([(build_scenes.box(*ROOM, inward=True), matte(0.0, 1.0))])
     folder = tmp_path_factory.mktemp("furnace")
-    job.bake(room, folder, Settings(samples=256, bounces=4))
+    job.bake(room, folder, Settings(samples=256, bounces=0))
     return reconstruction.open_bake(folder, folder / "cache")
 
 
@@ -101,8 +101,8 @@ def test_points_lie_on_both_sides_of_a_sheet_and_not_behind_a_wall_or_far_away()
     walls = build_scenes.box(*ROOM, inward=True)
     ground, cellar = build_scenes.plane(100.0), build_scenes.plane(100.0, -3.0)
     scene = prepare(build_scenes.snapshot([(np.concatenate([sheet, walls, ground, cellar]), matte(0.5))]), Model())
-    found = receivers.spread(scene, 4000, near=9.0)
-    again = receivers.spread(scene, 4000, near=9.0)
+    found = receivers.spread(scene, 1000, near=9.0)
+    again = receivers.spread(scene, 1000, near=9.0)
     np.testing.assert_array_equal(found.point, again.point)
     on_sheet = np.abs(found.point[:, 2] - 3) < 1e-6
     on_sheet &= (np.abs(found.point[:, :2] - 3) < 1).all(axis=1)
