@@ -63,6 +63,7 @@ class Tracer:
         self._all = _commit(corners)
         self._transparent_rows = np.flatnonzero(transparent).astype(np.int32)
         some = len(self._transparent_rows) > 0
+        self._opaque_rows = np.flatnonzero(~transparent).astype(np.int32)
         self._opaque = _commit(corners[~transparent]) if some else self._all
         self._transparent = _commit(corners[transparent]) if some else None
         self._lock = threading.Lock()
@@ -91,6 +92,23 @@ class Tracer:
         """
         return self._first_hit(self._all, origin, direction, None)
 
+    def intersect_opaque(self, origin: np.ndarray, direction: np.ndarray, far: np.ndarray) -> Hits:
+        """First opaque triangle on each ray.
+
+        Parameters
+        ----------
+        origin, direction : (3, n) float32 ndarray
+            Rays [m].
+        far : (n,) float32 ndarray
+            Where they end, in lengths of `direction`.
+
+        Returns
+        -------
+        Hits
+            `triangle` counts in the full set of triangles.
+        """
+        return _renumbered(self._first_hit(self._opaque, origin, direction, far), self._opaque_rows)
+
     def intersect_transparent(self, origin: np.ndarray, direction: np.ndarray, far: np.ndarray) -> Hits:
         """First transparent triangle on each ray.
 
@@ -106,9 +124,7 @@ class Tracer:
         Hits
             `triangle` counts in the full set of triangles.
         """
-        hits = self._first_hit(self._transparent, origin, direction, far)
-        rows = np.where(hits.triangle >= 0, self._transparent_rows[hits.triangle], np.int32(MISS))
-        return Hits(rows, hits.distance, hits.u, hits.v, hits.normal)
+        return _renumbered(self._first_hit(self._transparent, origin, direction, far), self._transparent_rows)
 
     def blocked(self, origin: np.ndarray, direction: np.ndarray, far: np.ndarray) -> np.ndarray:
         """Whether an opaque triangle lies on each segment.
@@ -174,6 +190,14 @@ def _commit(corners: np.ndarray) -> EmbreeScene:
     nowhere = np.zeros((1, 3), np.float32)
     scene.run(nowhere, np.ones((1, 3), np.float32))
     return scene
+
+
+def _renumbered(hits: Hits, rows: np.ndarray) -> Hits:
+    """Hits on some of the triangles, as rows of all."""
+    if not len(rows):
+        return hits
+    triangle = np.where(hits.triangle >= 0, rows[hits.triangle], np.int32(MISS))
+    return Hits(triangle, hits.distance, hits.u, hits.v, hits.normal)
 
 
 def _check(origin: np.ndarray, direction: np.ndarray, far: np.ndarray | None) -> None:

@@ -1,0 +1,145 @@
+"""Sight: which data points of its stencil a receiver sees, and what stands before the others.
+
+Comes in: a scene, data points, receivers. Goes out: one pair for each receiver and data point that matters to it, with
+the opaque triangles that block it, seen from either end. Transparent surfaces hide nothing, as for shadow rays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..tree import interpolate
+from .gather import TILE_LANES, run_tiles
+from .rays import MISS
+from .receivers import Receivers, lifted
+from .scene import Scene
+
+NEGLIGIBLE = 2.5e-4
+"""Weights up to this are not looked at."""
+
+SHORTENED = np.float32(0.9999)
+"""Rays end before their target: a data point may lie close to a surface, a receiver lies on one."""
+
+TAPS = 8
+"""Taps that a tile's receivers have at most, in the mean: 16 where levels meet, less those behind the surface."""
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Receivers and data points with some weight there; sorted by data point, then by receiver.
+
+    receiver : (m,) int64, row of the receivers
+    point : (m,) int64, row of the data points
+    weight : (m,) float32, stencil weight times the cosine at the receiver
+    blocker : (m, 2) int32, the first opaque triangle seen from the receiver, and from the data point; -1 for none
+    """
+
+    receiver: np.ndarray
+    point: np.ndarray
+    weight: np.ndarray
+    blocker: np.ndarray
+
+    @property
+    def visible(self) -> np.ndarray:
+        """(m,) bool, whether nothing is between."""
+        return self.blocker[:, 0] == MISS
+
+    def take(self, rows: np.ndarray) -> Pairs:
+        """Some of the pairs.
+
+        Parameters
+        ----------
+        rows : (k,) int64, (m,) bool ndarray or slice
+            Which.
+
+        Returns
+        -------
+        Pairs
+            In the order of `rows`.
+        """
+        return Pairs(self.receiver[rows], self.point[rows], self.weight[rows], self.blocker[rows])
+
+
+def look(
+    scene: Scene,
+    data: interpolate.DataPoints,
+    receivers: Receivers,
+    threads: int = 0,
+    progress: Callable[[int], bool] | None = None,
+) -> Pairs:
+    """Trace a shadow ray for each receiver and data point of its stencil.
+
+    Parameters
+    ----------
+    scene : Scene
+        What stands in the way.
+    data : DataPoints
+        Data points; occluding planes that they have already do not count.
+    receivers : Receivers
+        Points on surfaces.
+    threads : int
+        Worker threads; 0 uses every core.
+    progress : callable, optional
+        As in `gather.run_tiles`, counting receivers.
+
+    Returns
+    -------
+    Pairs
+        Those in front of the receiver's surface, with valid data points.
+
+    Raises
+    ------
+    CancelledError
+        `progress` returned False.
+    """
+    data, found = replace(data, planes=np.full_like(data.planes, -1)), {}
+
+    def work(rows: np.ndarray) -> int:
+        part = receivers.take(rows)
+        receiver, point, weight = _taps(data, part)
+        start = np.ascontiguousarray(lifted(scene, part)[:, receiver])
+        blocker = _blockers(scene, start, data.position[point].T.astype(np.float32))
+        found[int(rows[0])] = Pairs(rows[receiver], point, weight, blocker)
+        return len(rows)
+
+    count, step = len(receivers.key), TILE_LANES // TAPS
+    run_tiles(work, [np.arange(a, min(a + step, count)) for a in range(0, count, step)], threads, progress)
+    return _sorted([found[first] for first in sorted(found)])
+
+
+def _taps(data: interpolate.DataPoints, receivers: Receivers):
+    """(receiver, point, weight) of the taps that matter."""
+    position, normal = (np.ascontiguousarray(column.T) for column in (receivers.position, receivers.normal))
+    parts = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.float32))]
+    for taps in interpolate.layers(data, position, normal):
+        corner, column = np.nonzero(taps.weight > NEGLIGIBLE)
+        parts.append((taps.point[column], taps.row[corner, column].astype(np.int64), taps.weight[corner, column]))
+    return (np.concatenate(columns) for columns in zip(*parts, strict=True))
+
+
+def _blockers(scene: Scene, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """(m, 2) first opaque triangles from start to end and from end to start."""
+    way = np.ascontiguousarray(end - start)
+    blocker = np.full((way.shape[1], 2), MISS, np.int32)
+    blocker[:, 0] = _first(scene, start, way)
+    hidden = np.flatnonzero(blocker[:, 0] != MISS)
+    back = _first(scene, np.ascontiguousarray(end[:, hidden]), -way[:, hidden])
+    blocker[hidden, 1] = np.where(back == MISS, blocker[hidden, 0], back)
+    return blocker
+
+
+def _first(scene: Scene, origin: np.ndarray, way: np.ndarray) -> np.ndarray:
+    """(m,) first opaque triangle on each segment."""
+    far = np.full(way.shape[1], SHORTENED)
+    return scene.tracer.intersect_opaque(origin, way, far).triangle.astype(np.int32)
+
+
+def _sorted(parts: list[Pairs]) -> Pairs:
+    """All pairs, by data point; those of a data point stay in the order of the receivers."""
+    empty = Pairs(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.float32), np.zeros((0, 2), np.int32))
+    names = ("receiver", "point", "weight", "blocker")
+    pairs = Pairs(*(np.concatenate([getattr(part, name) for part in (empty, *parts)]) for name in names))
+    return pairs.take(np.argsort(pairs.point, kind="stable"))
