@@ -41,8 +41,10 @@ def overlap(triangles: np.ndarray, centers: np.ndarray, half: np.ndarray | float
     """
     corners = np.asarray(triangles, np.float64) - np.asarray(centers, np.float64)[:, None, :]
     half = np.broadcast_to(np.asarray(half, np.float64), (len(corners), 3))
-    scale = np.abs(corners).max(axis=(1, 2), initial=0.0) + half.max(axis=1, initial=0.0)
-    apart = ((corners.min(axis=1) > half) | (corners.max(axis=1) < -half)).any(axis=1)
+    low, high = _extremes(corners[:, 0], corners[:, 1], corners[:, 2])
+    scale = _extremes(*np.maximum(high, -low).T)[1] + _extremes(*half.T)[1]
+    x, y, z = ((low > half) | (high < -half)).T
+    apart = x | y | z
     near = np.flatnonzero(~apart)
     corners, half, scale = corners[near], half[near], scale[near]
     edges = np.roll(corners, -1, axis=1) - corners
@@ -68,5 +70,11 @@ def _separates(axes: np.ndarray, corners: np.ndarray, half: np.ndarray, scale: n
     projections = np.einsum("nij,nj->ni", corners, axes)
     length = np.abs(axes)
     radius = np.einsum("nj,nj->n", half, length)
-    slack = TOLERANCE * scale * length.sum(axis=1)
-    return (projections.min(axis=1) > radius + slack) | (projections.max(axis=1) < -radius - slack)
+    slack = TOLERANCE * scale * (length[:, 0] + length[:, 1] + length[:, 2])
+    low, high = _extremes(*projections.T)
+    return (low > radius + slack) | (high < -radius - slack)
+
+
+def _extremes(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest of three, item by item: numpy is slow along a short axis."""
+    return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)

@@ -1,37 +1,40 @@
-"""Builds the voxel tree of a world cell from triangles, level by level, in bulk.
+"""Builds the voxel tree of a world cell: from its outline, a choice of what to subdivide, and dilation.
 
-Comes in: triangles in local metres. Goes out: a `Topology`, or None where the cell has no geometry.
-
-The dense first level covers the geometry's extent within the cell, in whole voxels: from the one that holds the
-lowest coordinate to the one that holds the highest, on each axis, and one more at the sides and the top where
-geometry comes close to the border. Below it a voxel exists where it overlaps a
-triangle, touching included, and its parent is subdivided. Pairs of triangle and voxel go from level to level: the
-children of a pair are tested only against its own triangle.
+Comes in: triangles, or an `Outline` with a choice. Goes out: a `Topology` under the cap on data points. Where the
+cap binds, candidates are taken in the order of their need, parents before children, as many as fit together with
+the voxels that dilation adds for them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 
 import numpy as np
 
-from . import bits, boxes
-from .grid import BRANCH, CELL_VOXELS, Grid, cell_range
-from .need import FLAT, Surfaces, Voxels, assess, surfaces_of
+from . import bits
+from .dilate import BESIDE_FULL, DILATIONS, dilate
+from .first_level import occupied_cells
+from .grid import BRANCH, Grid
+from .need import FLAT
+from .outline import Outline, outline
+from .region import finder
 from .topology import MAX_POINTS, Topology, child_coords, link_blocks
 
-__all__ = ["build", "occupied_cells"]
+__all__ = ["build", "fit", "grow", "occupied_cells"]
 
-ROOM = 0.5
-"""Free space that the dense grid keeps between geometry and its sides and top [first-level voxels]."""
-CHUNK = 1 << 18
-"""Pairs tested at a time: about 100 MB of temporaries."""
+CLOSE = 0.002
+"""Part of the cap that may stay unused: bisection ends there."""
 
 
 def build(
-    triangles: np.ndarray, grid: Grid, cell: tuple[int, int], max_points: int = MAX_POINTS, flat: float = FLAT
+    triangles: np.ndarray,
+    grid: Grid,
+    cell: tuple[int, int],
+    max_points: int = MAX_POINTS,
+    flat: float = FLAT,
+    dilation: str = "partial",
 ) -> Topology | None:
-    """Build the tree of one world cell.
+    """Build the tree of one world cell from geometry alone.
 
     Parameters
     ----------
@@ -46,241 +49,213 @@ def build(
         before fine ones and, within a level, voxels of the most varied geometry before others.
     flat : float
         Voxels whose surroundings are planar within this many sizes are not subdivided; negative: all are.
+    dilation : str
+        As for `grow`.
 
     Returns
     -------
     Topology or None
-        None where no triangle lies in the cell. `left_out` counts the voxels that the cap left whole, or dropped.
+        None for a cell that needs no tree. `left_out` counts the voxels that the cap left whole, or dropped.
 
     Raises
     ------
     ValueError
         For triangles that are not (n, 3, 3) or not finite; for a cap below the size of one layer of voxels.
     """
-    surfaces = surfaces_of(_in_cell(_check(triangles), grid, cell))
-    triangle, coords, proper = _first_pairs(surfaces, grid, cell)
-    if not proper.any():
-        return None
-    low, high, left_out = _first_bounds(coords[proper], min(max_points, MAX_POINTS))
-    low, high = _with_room(surfaces, triangle[proper], coords[proper], (low, high), grid, cell, max_points)
-    inside = ((coords >= low) & (coords <= high)).all(axis=1)
-    shape = high - low + 1
-    voxels = _number_first(triangle[inside], coords[inside] - low, low, shape, grid.first_size)
-    dense = np.ravel_multi_index((voxels.coords - low)[:, ::-1].T, shape[::-1])
-    budget = min(max_points, MAX_POINTS) - int(np.prod(shape))
-    masks, blocked = _subdivide(surfaces, voxels, grid, budget, flat)
-    nodes = _to_nodes(masks, dense, int(np.prod(shape)))
-    to_ints = [tuple(int(n) for n in numbers) for numbers in (cell, low, shape)]
-    return Topology(*to_ints, nodes, grid.levels, left_out + blocked)
+    found = outline(triangles, grid, cell, flat, max_points)
+    return None if found is None else grow(found, None, dilation, max_points)
 
 
-def occupied_cells(triangles: np.ndarray, grid: Grid) -> np.ndarray:
-    """Return the world cells that have geometry, those for which `build` returns a tree.
+def grow(
+    outline: Outline,
+    divided: Sequence[np.ndarray] | None = None,
+    dilation: str = "partial",
+    max_points: int = MAX_POINTS,
+) -> Topology:
+    """Build the tree in which chosen candidates are subdivided.
 
     Parameters
     ----------
-    triangles : (n, 3, 3) float32
-        Corners, relative to the grid's origin [m].
-    grid : Grid
-        The lattice.
+    outline : Outline
+        The cell.
+    divided : sequence of (m,) bool, optional
+        For each level but the finest, which solid voxels to subdivide; those that are no candidates, or whose
+        parents are whole, do not count. Without it all candidates are.
+    dilation : str
+        "partial" adds voxels to the upper levels, so that every neighbourhood has data of one or two levels;
+        "full" also surrounds the solid voxels of the finest level, so that those around surfaces have data of that
+        level only; "none" adds none.
+    max_points : int
+        Cap on the number of data points; more than `MAX_POINTS` is cut to it. Where it binds, coarse levels come
+        before fine ones and, within a level, voxels of the most varied geometry before others.
 
     Returns
     -------
-    (m, 2) int64
-        Cells (i, j), sorted.
+    Topology
+        The tree. Where the voxels that full dilation adds on account of other cells alone exceed the cap, it has
+        partial dilation; where those of partial dilation do, none.
 
     Raises
     ------
     ValueError
-        For triangles that are not (n, 3, 3) or not finite.
+        For masks that do not fit the outline, and for another word for dilation.
     """
-    triangles = _check(triangles)
-    first, last = cell_range(grid, *(_bounds(triangles)[:, :, :2]))
-    found = [np.zeros((0, 2), np.int64)]
-    tallest = np.abs(triangles[:, :, 2]).max(initial=0.0) + grid.cell_size
-    half = np.array([0.5 * grid.cell_size, 0.5 * grid.cell_size, tallest])
-    for item, coords in _enumerate(first, last):
-        centers = np.concatenate([(coords + 0.5) * grid.cell_size, np.zeros((len(coords), 1))], axis=1)
-        simple = (first[item] == last[item]).all(axis=1)
-        simple[~simple] = boxes.overlap(triangles[item[~simple]], centers[~simple], half)
-        found.append(np.unique(coords[simple], axis=0))
-    return np.unique(np.concatenate(found), axis=0)
+    chosen = _descendants(outline, outline.wanted if divided is None else _checked(outline, divided, bool))
+    order = _Order(outline, chosen, [np.full(len(mask), -level) for level, mask in enumerate(chosen)], outline.need)
+    return _largest(outline, order, dilation, min(max_points, MAX_POINTS))
 
 
-def _check(triangles: np.ndarray) -> np.ndarray:
-    """Refuse what cannot be voxelised, at the border."""
-    triangles = np.asarray(triangles)
-    if triangles.ndim != 3 or triangles.shape[1:] != (3, 3):
-        raise ValueError(f"triangles have shape {triangles.shape}; (n, 3, 3) is needed")
-    if not np.isfinite(triangles).all():
-        raise ValueError("a triangle's corner is not finite; remove NaN and infinite vertices before the bake")
-    return triangles
+def fit(
+    outline: Outline, need: Sequence[np.ndarray], dilation: str = "partial", max_points: int = MAX_POINTS
+) -> Topology:
+    """Build the tree of the neediest candidates that fit under a cap.
+
+    Parameters
+    ----------
+    outline : Outline
+        The cell.
+    need : sequence of (m,) float64
+        For each level but the finest, how much each solid voxel needs subdivision, of all levels on one scale; 0 or
+        less leaves it whole. No voxel counts for more than its parent, so that parents come first.
+    dilation : str
+        As for `grow`.
+    max_points : int
+        Cap on the number of data points, dilation included; more than `MAX_POINTS` is cut to it.
+
+    Returns
+    -------
+    Topology
+        The tree. `left_out` counts the voxels in need that it leaves whole.
+
+    Raises
+    ------
+    ValueError
+        For rows that do not fit the outline or are NaN, and for another word for dilation.
+    """
+    need = _checked(outline, need, np.float64)
+    for level in range(1, len(need)):
+        need[level] = np.minimum(need[level], need[level - 1][outline.parent[level]])
+    chosen = _descendants(outline, [values > 0 for values in need])
+    order = _Order(outline, chosen, need, [np.zeros(len(values)) for values in need])
+    return _largest(outline, order, dilation, min(max_points, MAX_POINTS))
 
 
-def _bounds(triangles: np.ndarray) -> np.ndarray:
-    """(2, n, 3) float64 lowest and highest corner of each triangle."""
-    return np.stack([triangles.min(axis=1), triangles.max(axis=1)]).astype(np.float64)
+def _checked(outline: Outline, rows: Sequence[np.ndarray], dtype: type) -> list[np.ndarray]:
+    """One row of values for each level but the finest, copied."""
+    rows = [np.array(values, dtype) for values in rows]
+    if [len(values) for values in rows] != [len(values) for values in outline.wanted]:
+        found, due = ([len(values) for values in part] for part in (rows, outline.wanted))
+        raise ValueError(f"rows of {found} values; the outline has {due} voxels on its upper levels")
+    if any(np.isnan(values).any() for values in rows):
+        raise ValueError("a voxel's need is NaN")
+    return rows
 
 
-def _in_cell(triangles: np.ndarray, grid: Grid, cell: tuple[int, int]) -> np.ndarray:
-    """Triangles whose bounds touch the cell, in double precision."""
-    low, high = triangles[:, :, :2].min(axis=1), triangles[:, :, :2].max(axis=1)
-    start = np.asarray(cell, np.float64) * grid.cell_size
-    touches = ((high >= start) & (low <= start + grid.cell_size)).all(axis=1)
-    return triangles[touches].astype(np.float64)
+def _descendants(outline: Outline, masks: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """The candidates among chosen voxels whose parents are chosen as well."""
+    chosen = []
+    for level, mask in enumerate(masks):
+        mask = mask & outline.wanted[level]
+        chosen.append(mask & chosen[-1][outline.parent[level]] if level else mask)
+    return chosen
 
 
-def _enumerate(first: np.ndarray, last: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """List the integer points of many boxes in chunks of bounded size: box number, coordinates."""
-    extent = np.maximum(last - first + 1, 0)
-    ends = np.cumsum(np.prod(extent, axis=1))
-    total = int(ends[-1]) if len(ends) else 0
-    for start in range(0, total, CHUNK):
-        flat = np.arange(start, min(start + CHUNK, total))
-        item = np.searchsorted(ends, flat, side="right")
-        rest = flat - (ends[item] - np.prod(extent[item], axis=1))
-        coords = np.empty((len(flat), first.shape[1]), np.int64)
-        for axis in range(first.shape[1]):
-            coords[:, axis] = first[item, axis] + rest % extent[item, axis]
-            rest = rest // extent[item, axis]
-        yield item, coords
+class _Order:
+    """Candidates of all levels, first come first served, and what each would add."""
+
+    def __init__(self, outline: Outline, chosen: list[np.ndarray], first: list[np.ndarray], then: Sequence[np.ndarray]):
+        rows = [np.flatnonzero(mask) for mask in chosen]
+        level = np.repeat(np.arange(len(rows)), [len(part) for part in rows])
+
+        def pick(parts):
+            return np.concatenate([np.zeros(0), *(part[row] for part, row in zip(parts, rows, strict=True))])
+
+        order = np.lexsort((-pick(then), level, -pick(first)))
+        self.outline, self.level = outline, level[order]
+        self.row = pick([np.arange(len(mask)) for mask in chosen])[order].astype(np.int64)
+        self.cost = pick([outline.cost(number) for number in range(len(rows))])[order].astype(np.int64)
+        self.solid = np.concatenate([[0], np.cumsum(self.cost)])
+        """Solid voxels that the first 0, 1, ... candidates add."""
+
+    def divided(self, count: int) -> list[np.ndarray]:
+        """Masks of the first so many candidates."""
+        masks = [np.zeros(len(mask), bool) for mask in self.outline.wanted]
+        for level, mask in enumerate(masks):
+            mask[self.row[:count][self.level[:count] == level]] = True
+        return masks
+
+    def refused(self, count: int) -> int:
+        """How many of the others exist and have something to add."""
+        divided, total = self.divided(count), 0
+        rest = np.arange(len(self.row)) >= count
+        for level, parent in enumerate(self.outline.parent[:-1]):
+            row = self.row[rest & (self.level == level) & (self.cost > 0)]
+            total += int(divided[level - 1][parent[row]].sum()) if level else len(row)
+        return total
 
 
-def _overlapping(corners: np.ndarray, coords: np.ndarray, size: float) -> np.ndarray:
-    """Whether each triangle overlaps its voxel; one that lies inside needs no test of axes."""
-    low, high = corners.min(axis=1), corners.max(axis=1)
-    result = ((low >= coords * size) & (high <= (coords + 1) * size)).all(axis=1)
-    rest = np.flatnonzero(~result)
-    result[rest] = boxes.overlap(corners[rest], (coords[rest] + 0.5) * size, 0.5 * size)
-    return result
+def _largest(outline: Outline, order: _Order, dilation: str, max_points: int) -> Topology:
+    """The tree of the first candidates, as many as the cap allows, by bisection on their number."""
+    if dilation not in DILATIONS:
+        raise ValueError(f"dilation {dilation!r}; use one of {', '.join(DILATIONS)}")
+    room = max_points - int(np.prod(outline.dense.shape))
+    many = int(np.searchsorted(order.solid, room, side="right")) - 1
+    found = _voxels(outline, order.divided(many), dilation)
+    few = many if _count(found) <= room else 0
+    if few < many or _count(found) > room:
+        dilation, found = _least(outline, order, dilation, room)
+    while order.solid[many] - order.solid[few] > CLOSE * max_points and many - few > 1:
+        middle = (few + many) // 2
+        tried = _voxels(outline, order.divided(middle), dilation)
+        if _count(tried) <= room:
+            few, found = middle, tried
+        else:
+            many = middle
+    return _to_topology(outline, found, _count(found) - int(order.solid[few]), order.refused(few))
 
 
-def _first_pairs(surfaces: Surfaces, grid: Grid, cell: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pairs of the first level; a pair is proper when it counts for the extent of the dense grid."""
-    low, high = _bounds(surfaces.corners)
-    first, last = np.ceil(low / grid.first_size).astype(np.int64) - 1, np.floor(high / grid.first_size).astype(np.int64)
-    columns = np.asarray(cell) * CELL_VOXELS
-    first[:, :2], last[:, :2] = np.maximum(first[:, :2], columns), np.minimum(last[:, :2], columns + CELL_VOXELS - 1)
-    lowest, highest = cell_range(grid, low[:, :2], high[:, :2])
-    owned = ((lowest <= cell) & (highest >= cell)).all(axis=1)
-    found = [(np.zeros(0, np.int64), np.zeros((0, 3), np.int64))]
-    for item, coords in _enumerate(first, last):
-        keep = _overlapping(surfaces.corners[item], coords, grid.first_size)
-        found.append((item[keep], coords[keep]))
-    triangle, coords = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    proper = owned[triangle] & (coords >= np.floor(low / grid.first_size)[triangle]).all(axis=1)
-    return triangle, coords, proper
+def _least(outline: Outline, order: _Order, dilation: str, room: int) -> tuple[str, list[np.ndarray]]:
+    """The best dilation whose voxels fit, where nothing is subdivided and only other cells ask for some."""
+    for word in {"full": ("full", BESIDE_FULL), "partial": ("partial",)}.get(dilation, ()):
+        found = _voxels(outline, order.divided(0), word)
+        if _count(found) <= room:
+            return word, found
+    return "none", _voxels(outline, order.divided(0), "none")
 
 
-def _first_bounds(coords: np.ndarray, max_points: int) -> tuple[np.ndarray, np.ndarray, int]:
-    """Extent of the dense grid, and how many solid voxels it drops: a stray object far above must not blow it up."""
-    low, high = coords.min(axis=0), coords.max(axis=0)
-    layer = int(np.prod((high - low + 1)[:2]))
-    if layer > max_points:
-        raise ValueError(f"{max_points} data points cannot hold one layer of {layer} first-level voxels; raise the cap")
-    if layer * int(high[2] - low[2] + 1) <= max_points:
-        return low, high, 0
-    layers = max(1, max_points // 2 // layer)
-    z = np.sort(np.unique(coords, axis=0)[:, 2])
-    held = np.searchsorted(z, z + layers) - np.searchsorted(z, z)
-    low[2] = z[np.argmax(held)]
-    high[2] = min(low[2] + layers - 1, high[2])
-    return low, high, len(z) - int(held.max())
+def _voxels(outline: Outline, divided: list[np.ndarray], dilation: str) -> list[np.ndarray]:
+    """All voxels below the dense grid when some are subdivided."""
+    solid = [outline.coords[0]]
+    for level, mask in enumerate(divided):
+        solid.append(outline.coords[level + 1][mask[outline.parent[level + 1]]])
+    return dilate(outline, solid, dilation)
 
 
-def _with_room(
-    surfaces: Surfaces,
-    triangle: np.ndarray,
-    coords: np.ndarray,
-    extent: tuple[np.ndarray, np.ndarray],
-    grid: Grid,
-    cell: tuple[int, int],
-    max_points: int,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Grow the dense grid at the sides and the top where geometry comes close: what faces outwards there, or stands
-    on a ground just below a layer's border, needs data points in the open. The cell's own columns are the limit."""
-    size, room = grid.first_size, ROOM * grid.first_size
-    lowest, highest = _bounds(surfaces.corners)
-    inside_low = np.maximum(lowest[triangle], coords * size).min(axis=0)
-    inside_high = np.minimum(highest[triangle], (coords + 1) * size).max(axis=0)
-    columns = np.asarray(cell) * CELL_VOXELS
-    low, high = (values.copy() for values in extent)
-    low[:2] -= (inside_low - extent[0] * size < room)[:2] & (low[:2] > columns)
-    high[:2] += ((extent[1] + 1) * size - inside_high < room)[:2] & (high[:2] < columns + CELL_VOXELS - 1)
-    high[2] += (extent[1][2] + 1) * size - inside_high[2] < room
-    fits = np.prod(high - low + 1) <= min(max_points, MAX_POINTS) // 2
-    return (low, high) if fits else extent
+def _count(voxels: list[np.ndarray]) -> int:
+    """Data points below the dense grid."""
+    return sum(map(len, voxels))
 
 
-def _number_first(triangle: np.ndarray, place: np.ndarray, low: np.ndarray, shape: np.ndarray, size: float) -> Voxels:
-    """Number the solid voxels of the first level in the order of the dense grid."""
-    key = np.ravel_multi_index(place[:, ::-1].T, shape[::-1])
-    solid, row = np.unique(key, return_inverse=True)
-    order = np.argsort(row, kind="stable")
-    coords = np.stack(np.unravel_index(solid, shape[::-1])[::-1], axis=-1) + low
-    return Voxels(coords, size, triangle[order], row.reshape(-1)[order])
+def _to_topology(outline: Outline, voxels: list[np.ndarray], dilated: int, refused: int) -> Topology:
+    """Number the voxels: blocks of children in the order of their parents."""
+    low, shape = ([int(n) for n in numbers] for numbers in (outline.dense.low, outline.dense.shape))
+    grid_count = int(np.prod(shape))
+    coords, masks = outline.dense.coords(np.arange(grid_count)), []
+    for children in voxels[1:]:
+        x, y, z = np.moveaxis(children % BRANCH, -1, 0)
+        bit = x + BRANCH * (y + BRANCH * z)
+        masks.append(bits.pack(finder(coords)(children // BRANCH), bit, len(coords)))
+        parent, bit = bits.unpack(masks[-1])
+        coords = child_coords(coords[parent], bit)
+    nodes = _to_nodes(masks or [bits.zeros(grid_count)], grid_count)
+    left_out = outline.left_out + refused
+    return Topology(outline.cell, tuple(low), tuple(shape), nodes, outline.grid.levels, left_out, dilated)
 
 
-def _subdivide(
-    surfaces: Surfaces, voxels: Voxels, grid: Grid, budget: int, flat: float
-) -> tuple[list[np.ndarray], int]:
-    """Child masks of the solid voxels of each level but the last, and how many voxels the cap left whole."""
-    masks, left_out = [], 0
-    for level in range(grid.levels - 1):
-        if not len(voxels.coords):
-            break
-        wanted, need = assess(surfaces, voxels, flat)
-        mask, pairs = _children(surfaces, voxels, wanted)
-        cost = bits.popcount(mask)
-        order = np.lexsort((np.arange(len(need)), -need, ~wanted))
-        refused = order[np.cumsum(cost[order]) > budget]
-        left_out += int((cost[refused] > 0).sum())
-        mask[refused] = 0
-        budget -= int(bits.popcount(mask).sum())
-        masks.append(mask)
-        if level < grid.levels - 2:
-            voxels = _next_voxels(voxels, mask, pairs)
-    return masks, left_out
-
-
-def _children(
-    surfaces: Surfaces, voxels: Voxels, wanted: np.ndarray
-) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Masks of all voxels, and pairs (triangle, parent's row, bit), for the wanted voxels only."""
-    pair = np.flatnonzero(wanted[voxels.row])
-    size, base = voxels.size / BRANCH, voxels.coords[voxels.row[pair]] * BRANCH
-    low, high = _bounds(surfaces.corners)
-    first = np.maximum(np.ceil(low / size).astype(np.int64)[voxels.triangle[pair]] - 1, base)
-    last = np.minimum(np.floor(high / size).astype(np.int64)[voxels.triangle[pair]], base + BRANCH - 1)
-    found = [(np.zeros(0, np.int64),) * 3]
-    for item, coords in _enumerate(first, last):
-        triangle = voxels.triangle[pair[item]]
-        keep = np.flatnonzero(_overlapping(surfaces.corners[triangle], coords, size))
-        x, y, z = np.moveaxis(coords[keep] - base[item[keep]], -1, 0)
-        found.append((triangle[keep], voxels.row[pair[item[keep]]], x + BRANCH * (y + BRANCH * z)))
-    pairs = tuple(np.concatenate(parts) for parts in zip(*found, strict=True))
-    return bits.pack(pairs[1], pairs[2], len(voxels.coords)), pairs
-
-
-def _next_voxels(voxels: Voxels, mask: np.ndarray, pairs: tuple[np.ndarray, np.ndarray, np.ndarray]) -> Voxels:
-    """The children that exist, in the order of their indices, with their pairs."""
-    triangle, row, bit = pairs
-    kept = np.flatnonzero(bits.contains(mask[row], bit))
-    parent, child_bit = bits.unpack(mask)
-    number = np.searchsorted(parent * 64 + child_bit, row[kept] * 64 + bit[kept])
-    order = np.argsort(number, kind="stable")
-    coords = child_coords(voxels.coords[parent], child_bit)
-    return Voxels(coords, voxels.size / BRANCH, triangle[kept][order], number[order])
-
-
-def _to_nodes(masks: list[np.ndarray], dense: np.ndarray, grid_count: int) -> np.ndarray:
+def _to_nodes(masks: list[np.ndarray], grid_count: int) -> np.ndarray:
     """Lay the masks of all levels out as one node array; a block whose voxels have no children needs no nodes."""
-    mask, terminal = bits.zeros(grid_count), np.ones(grid_count, bool)
-    if not masks:
-        return link_blocks(mask, terminal, grid_count)
     terminals = [_terminal(here, below) for here, below in zip(masks, [*masks[1:], None], strict=True)]
-    mask[dense], terminal[dense] = masks[0], terminals[0]
-    kept_masks, kept_terminals = [mask], [terminal]
+    kept_masks, kept_terminals = [masks[0]], [terminals[0]]
     for level in range(1, len(masks)):
         has_node = np.repeat(~terminals[level - 1], bits.popcount(masks[level - 1]))
         kept_masks.append(masks[level][has_node])

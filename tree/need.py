@@ -12,7 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["FLAT", "Surfaces", "Voxels", "assess", "surfaces_of"]
+from .region import finder
+
+__all__ = ["FLAT", "Surfaces", "Voxels", "assess", "bounds", "surfaces_of"]
 
 FLAT = 1e-3
 """Distance from a common plane, in voxel sizes, within which geometry counts as flat."""
@@ -28,11 +30,14 @@ class Surfaces:
     corners : (t, 3, 3) float64 [m]
     normal : (t, 3) float64, unit length, zero where there is no area
     area : (t,) float64 [m2]
+    low, high : (t, 3) float64, corners of their boxes [m]
     """
 
     corners: np.ndarray
     normal: np.ndarray
     area: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -50,6 +55,24 @@ class Voxels:
     row: np.ndarray
 
 
+def bounds(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the box of each triangle.
+
+    Parameters
+    ----------
+    triangles : (n, 3, d) float
+        Corners [m].
+
+    Returns
+    -------
+    low, high : (n, d) float64
+        Lowest and highest corner [m].
+    """
+    first, second, third = triangles[:, 0], triangles[:, 1], triangles[:, 2]
+    low, high = np.minimum(np.minimum(first, second), third), np.maximum(np.maximum(first, second), third)
+    return low.astype(np.float64), high.astype(np.float64)
+
+
 def surfaces_of(corners: np.ndarray) -> Surfaces:
     """Compute normals and areas.
 
@@ -65,7 +88,7 @@ def surfaces_of(corners: np.ndarray) -> Surfaces:
     """
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(cross, axis=1)
-    return Surfaces(corners, cross / np.where(length > 0, length, 1.0)[:, None], 0.5 * length)
+    return Surfaces(corners, cross / np.where(length > 0, length, 1.0)[:, None], 0.5 * length, *bounds(corners))
 
 
 def assess(surfaces: Surfaces, voxels: Voxels, flat: float = FLAT) -> tuple[np.ndarray, np.ndarray]:
@@ -93,7 +116,7 @@ def assess(surfaces: Surfaces, voxels: Voxels, flat: float = FLAT) -> tuple[np.n
     spread = _spreads(surfaces, voxels)
     centers = (voxels.coords + 0.5) * voxels.size
     wanted, near = ~own_flat, np.zeros(len(spread))
-    find = _finder(voxels.coords)
+    find = finder(voxels.coords)
     for offset in NEIGHBOURS:
         other = find(voxels.coords + offset)
         row = np.flatnonzero(other >= 0)
@@ -145,24 +168,3 @@ def _spreads(surfaces: Surfaces, voxels: Voxels) -> np.ndarray:
         moments[j, i] = moments[i, j]
     trace = np.trace(moments)
     return np.where(trace > 0, 1.0 - (moments**2).sum(axis=(0, 1)) / np.where(trace > 0, trace, 1.0) ** 2, 0.0)
-
-
-def _finder(coords: np.ndarray):
-    """Return a function from voxel coordinates to rows, -1 where there is none."""
-    low = coords.min(axis=0) - 1
-    extent = coords.max(axis=0) - low + 2
-
-    def encode(c: np.ndarray) -> np.ndarray:
-        x, y, z = np.moveaxis(c - low, -1, 0)
-        return (z * extent[1] + y) * extent[0] + x
-
-    keys = encode(coords)
-    order = np.argsort(keys, kind="stable")
-    keys = keys[order]
-
-    def find(c: np.ndarray) -> np.ndarray:
-        wanted = encode(c)
-        place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-        return np.where(keys[place] == wanted, order[place], -1)
-
-    return find

@@ -50,6 +50,8 @@ class Topology:
         Number of levels that the grid allows; the tree may be shallower.
     left_out : int
         Voxels that geometry asked to subdivide, or to cover, and the cap on data points did not allow.
+    dilated : int
+        Voxels that exist only so that neighbourhoods have data of one or two levels.
     """
 
     cell: tuple[int, int]
@@ -58,6 +60,7 @@ class Topology:
     nodes: np.ndarray
     levels: int
     left_out: int = 0
+    dilated: int = 0
 
     @property
     def grid_count(self) -> int:

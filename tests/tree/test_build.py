@@ -47,10 +47,11 @@ def as_sets(topology):
 @pytest.mark.parametrize("cell", [(0, 0), (-1, 0), (-1, -1)])
 def test_voxels_are_those_that_overlap_a_triangle(seed, cell):
     triangles, grid = meshes.soup(8, seed, size=4.0), Grid()
-    topology = build.build(triangles, grid, cell, flat=ALL)
+    topology = build.build(triangles, grid, cell, flat=ALL, dilation="none")
     expected = expected_voxels(triangles, grid, topology)
     assert as_sets(topology) == [set(map(tuple, coords.tolist())) for coords in expected]
     assert topology.size == sum(map(len, expected))
+    assert topology.dilated == 0
     assert validate.first_defect(topology) is None
 
 
@@ -61,23 +62,38 @@ def test_touching_counts_below_the_first_level():
     assert set(coords[level == 1][:, 2].tolist()) == {0, 1}
 
 
-def test_the_dense_level_covers_the_extent_from_floor_to_floor():
-    topology = build.build(meshes.box((5.0, 13.0, 0.0), (27.0, 19.0, 16.0)), Grid(), (0, 0))
-    assert (topology.grid_min, topology.grid_shape) == ((0, 1, 0), (4, 2, 3))
-    assert (topology.voxels()[0] == 0).sum() == 24
+def test_the_dense_level_has_the_voxels_whose_centres_surround_the_geometry():
+    """From 5 to 27 m: centres at 4 to 28 m, voxels 0 to 3; from 13 to 19: 12 to 20; from 1 to 15: -4 to 20."""
+    topology = build.build(meshes.box((5.0, 13.0, 1.0), (27.0, 19.0, 15.0)), Grid(), (0, 0))
+    assert (topology.grid_min, topology.grid_shape) == ((0, 1, -1), (4, 2, 4))
+    assert (topology.voxels()[0] == 0).sum() == 32
 
 
-@pytest.mark.parametrize("height", [-0.02, -0.2, 7.98, 5.0])
-def test_ground_close_below_a_layer_s_border_gets_a_layer_of_open_space_above_it(height):
+@pytest.mark.parametrize(
+    ("height", "low", "layers"), [(0.0, -1, 2), (-0.2, -1, 2), (7.98, 0, 2), (5.0, 0, 2), (4.0, -1, 3)]
+)
+def test_ground_has_data_points_above_and_below_it(height, low, layers):
+    """At 4 m the ground lies in the data points, and counts as touching both neighbours."""
     topology = build.build(meshes.ground(60.0) + np.float32([0, 0, height]), Grid(), (0, 0))
-    assert topology.grid_shape[2] == 2
-    assert topology.grid_min[2] + 1 == np.floor(height / 8) + 1
+    assert (topology.grid_min[2], topology.grid_shape[2]) == (low, layers)
 
 
-def test_facades_close_to_the_border_get_voxels_in_front_of_them_within_the_cell():
-    topology = build.build(meshes.box((9.0, 0.5, 1.0), (31.0, 12.0, 3.0)), Grid(), (0, 0))
-    assert topology.grid_min[:2] == (0, 0)
-    assert topology.grid_shape[:2] == (5, 2)
+def test_a_cell_without_geometry_supplies_the_data_points_in_front_of_a_facade():
+    """From -125 to 121.5 m: the next centres are at -132 and 124 m, so that only the cell on the left has to help."""
+    house, grid = meshes.box((-125.0, 10.0, 1.0), (121.5, 30.0, 3.0)), Grid()
+    assert build.occupied_cells(house, grid)[:, 0].tolist() == [-2, -1, 0]
+    topology = build.build(house, grid, (-2, 0), dilation="none")
+    assert (topology.grid_min, topology.grid_shape) == ((-17, 0, -1), (1, 5, 2))
+    assert topology.size == topology.grid_count
+    assert build.build(house, grid, (1, 0)) is None
+
+
+def test_ground_at_a_layer_s_border_is_not_refined_below():
+    """The second sheet lies in the voxels above z = 0, and no more than touches those below."""
+    sheets = np.concatenate([meshes.ground(60.0, 0.0), meshes.ground(60.0, 0.3)])
+    level, coords = build.build(sheets, Grid(), (0, 0), dilation="none").voxels()
+    assert coords[level == 0][:, 2].min() == -1
+    assert coords[level == 2][:, 2].min() == 0
 
 
 def test_order_of_triangles_does_not_matter():
@@ -89,11 +105,10 @@ def test_order_of_triangles_does_not_matter():
 
 def test_open_ground_stays_whole_and_a_box_on_it_is_refined():
     grid = Grid()
-    assert build.build(meshes.ground(60.0), grid, (0, 0)).size == 8 * 8
+    assert build.build(meshes.ground(60.0), grid, (0, 0)).size == 9 * 9 * 2
     assert build.build(meshes.ground(60.0), grid, (0, 0), flat=ALL).size > 10_000
     with_box = np.concatenate([meshes.ground(60.0), meshes.box((40, 40, 0.0), (42, 42, 1.5))])
-    topology = build.build(with_box, grid, (0, 0))
-    level, coords = topology.voxels()
+    level, coords = build.build(with_box, grid, (0, 0)).voxels()
     fine = (coords[level == 2] + 0.5) * 0.5
     assert len(fine) > 50
     assert (np.abs(fine[:, :2] - 41).max(axis=1) < 5.1).all()
@@ -128,7 +143,7 @@ def test_triangles_without_area_are_solid_but_ask_for_nothing():
     point, segment = np.full((1, 3, 3), 3.0), np.array([[[1, 1, 1], [5, 5, 5], [3, 3, 3]]])
     degenerate = np.concatenate([point, segment]).astype(np.float32)
     assert (build.build(degenerate, Grid(), (0, 0)).nodes["mask"] == 0).all()
-    topology = build.build(degenerate, Grid(), (0, 0), flat=ALL)
+    topology = build.build(degenerate, Grid(), (0, 0), flat=ALL, dilation="none")
     expected = expected_voxels(degenerate, Grid(), topology)
     assert as_sets(topology) == [set(map(tuple, coords.tolist())) for coords in expected]
 
@@ -172,8 +187,8 @@ def test_a_stray_object_far_above_does_not_blow_the_cell_up():
 
 
 def test_a_cap_below_one_layer_is_refused():
-    with pytest.raises(ValueError, match="one layer of 64"):
-        build.build(meshes.ground(60.0), Grid(), (0, 0), max_points=63)
+    with pytest.raises(ValueError, match="one layer of 81"):
+        build.build(meshes.ground(60.0), Grid(), (0, 0), max_points=80)
 
 
 def test_cells_without_geometry_have_no_tree():
@@ -192,11 +207,13 @@ def test_occupied_cells_are_those_with_a_tree():
     assert 10 < len(cells) < 30
 
 
-def test_ground_of_two_kilometres_has_256_cells_and_no_sliver_cells_at_its_edge():
+def test_ground_of_two_kilometres_has_256_cells_and_a_rim_of_cells_around_them():
     triangles, grid = meshes.ground(1024.0), Grid()
-    assert len(build.occupied_cells(triangles, grid)) == 256
-    assert build.build(triangles, grid, (8, 0)) is None
-    assert build.build(triangles, grid, (7, -8)).grid_shape == (16, 16, 1)
+    assert len(build.occupied_cells(triangles, grid)) == 18 * 18
+    assert len(build.occupied_cells(triangles * np.float32(0.995), grid)) == 16 * 16
+    assert build.build(triangles, grid, (9, 0)) is None
+    assert build.build(triangles, grid, (8, 0)).grid_shape == (1, 16, 2)
+    assert build.build(triangles, grid, (7, -8)).grid_shape == (16, 16, 2)
 
 
 def test_a_wall_on_the_border_of_two_cells_is_solid_in_both():
