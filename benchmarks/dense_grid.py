@@ -38,7 +38,7 @@ MOST_SAMPLED = 40_000
 
 @dataclass(frozen=True)
 class DenseGrid:
-    """Probes at the centres of cubes that fill a box.
+    """Probes on a cubic lattice over a box.
 
     low : (3,) float64, the first probe, relative to the scene's origin [m]
     spacing : float [m]
@@ -110,7 +110,7 @@ class DenseGrid:
         return np.take_along_axis(around, distance.argmin(axis=1)[:, None], axis=1)[:, 0]
 
 
-def build(scene: Scene, probes: float) -> DenseGrid:
+def build(scene: Scene, probes: float, inset: float = 0.5) -> DenseGrid:
     """Lay a grid over the scene's surfaces.
 
     Parameters
@@ -119,6 +119,9 @@ def build(scene: Scene, probes: float) -> DenseGrid:
         A prepared scene.
     probes : float
         At most so many.
+    inset : float
+        Distance of the outermost probes from the box in spacings: 0.5 puts them at the centres of cubes that fill the
+        box, 0 at their corners.
 
     Returns
     -------
@@ -127,12 +130,13 @@ def build(scene: Scene, probes: float) -> DenseGrid:
     """
     low, high = scene.soup.bounds
     extent = np.maximum(high - low, np.finfo(np.float32).tiny)
+    more = 1 - 2 * inset
     fine, coarse = 1e-6 * extent.max(), extent.max() * 2
     for _ in range(60):
         spacing = np.sqrt(fine * coarse)
-        fits = np.prod(np.ceil(extent / spacing)) <= probes
+        fits = np.prod(np.ceil(extent / spacing) + more) <= probes
         fine, coarse = (fine, spacing) if fits else (spacing, coarse)
-    shape = np.ceil(extent / coarse).astype(np.int64)
+    shape = (np.ceil(extent / coarse) + more).astype(np.int64)
     low = low - ((shape - 1) * coarse - extent) / 2
     rows = np.arange(np.prod(shape))
     parts = [_are_free(scene, _positions(low, coarse, shape, rows[k : k + CHUNK])) for k in range(0, len(rows), CHUNK)]

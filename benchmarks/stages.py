@@ -1,7 +1,8 @@
 """A bake at surface points, stage by stage between the truth and what is stored, and the error that each stage adds.
 
 Comes in: a bake's folder, points. Goes out: for each transport the light by path tracing, by nine harmonics at the
-point itself, by the bake's interpolation of noiseless data, of data as they were traced, and as they are stored.
+point itself, by the bake's interpolation of noiseless data, of data as they were traced, and as they are stored,
+which includes whatever a bake does with its data after tracing.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from gi_volumes.bake.settings import Settings, from_header
 from gi_volumes.bake.sobol import scramble
 from gi_volumes.benchmarks import errors
 from gi_volumes.benchmarks.receivers import Receivers
-from gi_volumes.benchmarks.stencils import Sites, Stencil, evaluate
+from gi_volumes.benchmarks.stencils import Sites, Stencil, evaluate, functions
 from gi_volumes.benchmarks.traced import Traced
 from gi_volumes.tree import harmonics, world
 from gi_volumes.tree.world import World
@@ -52,7 +53,7 @@ class Bake:
     @property
     def functions(self) -> int:
         """Functions of light that it holds, over all transports."""
-        return sum(values.table.shape[1] for values in self.world._values.values())
+        return functions(self.world)
 
 
 def open_bake(path: Path, cache: Path | None = None, threads: int = 0) -> Bake:
@@ -103,7 +104,7 @@ def stages(bake: Bake, paths: tuple[int, int], points: Receivers, used: Stencil,
     lift = LIFT * float(bake.world.grid.voxel_size(bake.world.grid.levels - 1))
     place = (points.point - traced.scene.origin + lift * normals).T.astype(np.float32)
     keys = scramble(np.arange(len(normals), dtype=np.uint32), 0xACE)
-    functions = harmonics.basis(normals)
+    basis = harmonics.basis(normals)
     reference = [traced.surface(points.point, normals, paths[0], seed) for seed in SEEDS]
     own = [traced.harmonics(place, keys, paths[0], seed) for seed in SEEDS]
     exact = [traced.harmonics(sites.position, sites.key, paths[1], seed) for seed in SEEDS]
@@ -113,7 +114,7 @@ def stages(bake: Bake, paths: tuple[int, int], points: Receivers, used: Stencil,
         stored = bake.world.irradiance(points.point, normals, transport=name)
         values[name] = {
             "reference": np.stack([half[name] for half in reference]) @ LUMINANCE,
-            "point": np.stack([evaluate(functions, half[name]) for half in own]) @ LUMINANCE,
+            "point": np.stack([evaluate(basis, half[name]) for half in own]) @ LUMINANCE,
             "exact": np.stack([used.irradiance(half[name]) for half in exact]) @ LUMINANCE,
             "repeated": used.irradiance(repeated[name]) @ LUMINANCE,
             "stored": stored * (bake.world.sun_irradiance if name == "sun" else 1.0) @ LUMINANCE,

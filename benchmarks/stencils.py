@@ -6,14 +6,12 @@ these data points are, and irradiance from any nine harmonics at them.
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 
 import numpy as np
 from gi_volumes.bake import datapoints
-from gi_volumes.tree import folder, harmonics
-from gi_volumes.tree.cells import OFFSET_STEPS
-from gi_volumes.tree.interpolate import weigh
+from gi_volumes.tree import blend, harmonics
+from gi_volumes.tree.interpolate import DataPoints, layers
 from gi_volumes.tree.world import World
 
 
@@ -117,23 +115,39 @@ def stencil(world: World, points: np.ndarray, normals: np.ndarray) -> Stencil:
     Stencil
         What its `irradiance` uses.
     """
-    row, weight = weigh(world._data, world.grid.to_local(points), normals)
-    used, place = np.unique(np.where(weight > 0, row, -1), return_inverse=True)
-    place = place.reshape(row.shape)
-    if len(used) and used[0] < 0:
-        used, place = used[1:], np.maximum(place - 1, 0)
-    return Stencil(used, place, np.where(weight > 0, weight, 0.0), harmonics.basis(normals))
+    data = world._data
+    local = np.ascontiguousarray(blend.clamp(data, world.grid.to_local(points)).T)
+    facing = np.ascontiguousarray(normals.T, np.float32)
+    parts = list(_taps(data, local, facing, data.grid.levels - 1, np.ones(len(points)), np.arange(len(points))))
+    point, row, weight = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    used, place = np.unique(row, return_inverse=True)
+    places, weights = _padded(len(points), point, place.reshape(-1), weight)
+    return Stencil(used, places, weights, harmonics.basis(normals))
 
 
-def sites(path: str | os.PathLike, world: World, used: np.ndarray) -> Sites:
+def functions(world: World) -> int:
+    """Count the functions of light that a bake holds.
+
+    Parameters
+    ----------
+    world : World
+        The bake.
+
+    Returns
+    -------
+    int
+        Over all transports: one, or one for each sun direction or function of the sky.
+    """
+    return sum(values.functions for values in world._values.values())
+
+
+def sites(world: World, used: np.ndarray) -> Sites:
     """Find where data points lie.
 
     Parameters
     ----------
-    path : str or Path
-        The bake's folder.
     world : World
-        The same, loaded.
+        The bake.
     used : (m,) int64 ndarray
         Global indices.
 
@@ -142,12 +156,44 @@ def sites(path: str | os.PathLike, world: World, used: np.ndarray) -> Sites:
     Sites
         As they were when they were baked.
     """
-    cells = [folder.read_cell(path, tuple(entry["cell"])) for entry in world.header["cells"]]
-    voxels = [cell.topology.voxels() for cell in cells]
-    level = np.concatenate([found[0] for found in voxels])[used].astype(np.int64)
-    coords = np.concatenate([found[1] for found in voxels])[used]
-    offset = np.concatenate([cell.offset for cell in cells])[used]
-    size = np.asarray(world.grid.voxel_size(level), np.float64)
-    position = world.grid.centers(level, coords) + offset.astype(np.float64) * (size / OFFSET_STEPS)[:, None]
-    key = datapoints.keys(level.astype(np.uint8), coords)
-    return Sites(np.ascontiguousarray(position.T.astype(np.float32)), key, level, offset.any(axis=1))
+    data = world._data
+    position = np.ascontiguousarray(data.position[used].T.astype(np.float32))
+    key = datapoints.keys(data.level[used], data.coords[used])
+    return Sites(position, key, data.level[used].astype(np.int64), data.offset[used].any(axis=1))
+
+
+def _taps(data: DataPoints, points: np.ndarray, normals: np.ndarray, level: int, share: np.ndarray, which: np.ndarray):
+    """(point, row, weight) of every tap with weight: the sums of `blend`, taken apart.
+
+    points : (3, n) [m], normals : (3, n), share : (n,) what the taps' weights sum to, which : (n,) number of the point
+    """
+    found = list(layers(data, points, normals, level) if level >= 0 else blend._plain(data, points))
+    total = np.zeros(points.shape[1])
+    for part in found:
+        total[part.point] += part.weight.sum(axis=0)
+    scale = share / np.maximum(total, blend.ENOUGH)
+    for part in found:
+        corner, column = np.nonzero(part.weight > 0)
+        point = part.point[column]
+        yield which[point], part.row[corner, column].astype(np.int64), part.weight[corner, column] * scale[point]
+    low = np.flatnonzero(total < blend.ENOUGH)
+    if not len(low):
+        return
+    rest = scale[low] * (blend.ENOUGH - total[low])
+    if level >= 0:
+        yield from _taps(data, points[:, low], normals[:, low], level - 1, rest, which[low])
+        return
+    rows = np.arange(len(data.valid), dtype=np.float64)[:, None]
+    nearest = blend._nearest(data, rows, points[:, low])[:, 0].astype(np.int64)
+    yield which[low], nearest, rest
+
+
+def _padded(count: int, point: np.ndarray, place: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(count, k) places and weights from a list of taps."""
+    order = np.argsort(point, kind="stable")
+    taps = np.bincount(point, minlength=count)
+    column = np.arange(len(point)) - np.repeat(np.cumsum(taps) - taps, taps)
+    places = np.zeros((count, max(1, int(taps.max(initial=0)))), np.int64)
+    weights = np.zeros(places.shape)
+    places[point[order], column], weights[point[order], column] = place[order], weight[order]
+    return places, weights
