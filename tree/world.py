@@ -9,17 +9,17 @@ three terms is clamped at 0 by itself, so that they add up whether they are aske
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 
 import numpy as np
 
-from . import folder, harmonics, payload
+from . import folder, harmonics
 from .blend import blend, clamp
 from .container import FileError
 from .grid import Grid
 from .interpolate import DataPoints, join
 from .lookup import Atlas
 from .suns import SunKeys
+from .values import Values
 
 __all__ = ["TRANSPORTS", "World", "load"]
 
@@ -30,25 +30,6 @@ CHUNK = 1 << 14
 """Points handled at a time: their temporaries stay in the cache of a core."""
 REMEMBERED = 4
 """Combinations of transports, sun and sky whose coefficients are kept for the next look-up."""
-
-
-@dataclass(frozen=True)
-class Values:
-    """One payload over all cells.
-
-    Parameters
-    ----------
-    entry : (n,) int64
-        Row of the table for each global index, -1 without data.
-    table : (m, K, 9, 3) float16
-        Entries of all cells.
-    scale : (m,) float64
-        Unit of each entry.
-    """
-
-    entry: np.ndarray
-    table: np.ndarray
-    scale: np.ndarray
 
 
 class World:
@@ -160,7 +141,7 @@ class World:
         if key not in self._remembered:
             while len(self._remembered) >= REMEMBERED:
                 self._remembered.pop(next(iter(self._remembered)))
-            parts = [_fold(self._values[name], factor) for name, factor in factors.items()]
+            parts = [self._values[name].folded(factor) for name, factor in factors.items()]
             self._remembered[key] = np.concatenate([np.zeros((len(self._data.valid), 0), np.float32), *parts], axis=1)
         return self._remembered[key]
 
@@ -215,7 +196,7 @@ class World:
         given = None if sky is None else _finite(sky, "sky")
         if values is None:
             return None
-        count = values.table.shape[1]
+        count = values.functions
         own = self.header["transports"]["sky"].get("radiance") if count > 1 else [[1.0, 1.0, 1.0]]
         if given is None:
             return np.array(own, np.float64)
@@ -265,27 +246,8 @@ def _data_points(grid: Grid, cells: list[folder.Cell]) -> DataPoints:
 
 
 def _join(name: str, cells: list[folder.Cell], atlas: Atlas) -> Values:
-    """One table over all cells; a cell without the payload has no data."""
-    present = [cell.payloads[name] for cell in cells if name in cell.payloads]
-    if len({p.table.shape[1] for p in present}) != 1:
-        raise ValueError(f"the cells hold different numbers of functions in their {name} payloads")
-    entry, start = np.full(atlas.first[-1], -1), 0
-    for cell, first in zip(cells, atlas.first[:-1], strict=True):
-        if name in cell.payloads:
-            index = cell.payloads[name].index.astype(np.int64)
-            entry[first : first + len(index)] = np.where(index == payload.NO_DATA, -1, index + start)
-            start += len(cell.payloads[name].table)
-    scale = np.concatenate([np.full(len(p.table), p.scale) for p in present])
-    return Values(entry, np.concatenate([p.table for p in present]), scale)
-
-
-def _fold(values: Values, factor: np.ndarray) -> np.ndarray:
-    """(rows, 27) float32 sum over functions of factor times coefficients; zeros where there is no data."""
-    table = np.zeros((len(values.table) + 1, 9, 3), np.float32)
-    for function in np.flatnonzero(factor.any(axis=1)):
-        unpacked = values.table[:, function].astype(np.float64) * values.scale[:, None, None]
-        table[:-1] += (unpacked * factor[function]).astype(np.float32)
-    return table.reshape(-1, 27)[values.entry]
+    """One payload over all cells."""
+    return Values(name, [cell.payloads.get(name) for cell in cells], atlas.first)
 
 
 def _check_rows(values: np.ndarray, what: str) -> np.ndarray:

@@ -274,7 +274,7 @@ def test_only_the_light_that_is_asked_for_is_modelled(level, tmp_path, words, mo
     there = {name.split(".")[-1] for name in cells_only(tmp_path)}
     assert there == {"tree", "points", *modelled}
     for name, count in functions.items():
-        assert payload.read_payload(tmp_path / f"cell_0_0.{name}")[0].table.shape[1] == count
+        assert payload.read_payload(tmp_path / f"cell_0_0.{name}")[0].functions == count
     assert all((result["bytes"][name] > 0) == (name in modelled) for name in ("local", "sun", "sky"))
     assert succeed("verify", tmp_path) == {"defects": []}
 
