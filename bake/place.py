@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from ..tree import container, folder
+from ..tree.planes import CellPlanes
 from ..tree.topology import Topology
 from ..tree.verify import Defect
 from . import snapshot_file
@@ -159,7 +160,14 @@ class Place:
             shutil.rmtree(staging, ignore_errors=True)
         return folder.assemble(self.target, self._header)["cells"] if self.taken else []
 
-    def write_cell(self, tree: Topology, payloads: dict, valid: np.ndarray, offset: np.ndarray) -> None:
+    def write_cell(
+        self,
+        tree: Topology,
+        payloads: dict,
+        valid: np.ndarray,
+        offset: np.ndarray,
+        planes: CellPlanes | None = None,
+    ) -> None:
         """Put all files of a cell into the folder, or none; the tree, which makes a cell count, comes last.
 
         Parameters
@@ -172,6 +180,8 @@ class Place:
             Which voxels have a data point.
         offset : (size, 3) int8 ndarray
             Data point minus voxel centre, in voxel sizes / 254.
+        planes : CellPlanes, optional
+            Occluding planes of the data points; none when left out.
 
         Raises
         ------
@@ -179,7 +189,7 @@ class Place:
             A file cannot be written.
         """
         with self._stage() as staging:
-            folder.write_cell(staging, tree, payloads, valid, offset, {"bake": self.identity})
+            folder.write_cell(staging, tree, payloads, valid, offset, {"bake": self.identity}, planes)
             self.take()
             for path in sorted(staging.iterdir(), key=lambda path: path.suffix == ".tree"):
                 path.replace(self.target / path.name)

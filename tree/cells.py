@@ -1,7 +1,7 @@
 """The files of one world cell: its tree, its data points and its payloads.
 
     cell_I_J.tree           topology; written last, it lists the cell's other files with their SHA-256
-    cell_I_J.points         offset and validity of the data points
+    cell_I_J.points         offset, validity and occluding planes of the data points
     cell_I_J.local|sun|sky  payloads; one that the scene does not need is absent
 
 Comes in: a tree and arrays over its index space. Goes out: files that are complete or absent, and that know the
@@ -19,6 +19,7 @@ import numpy as np
 
 from . import container, payload, validate
 from .container import FileError
+from .planes import NONE, CellPlanes, empty, planes_defect
 from .topology import NODE, Topology
 
 __all__ = [
@@ -56,6 +57,8 @@ class Cell:
         By name.
     meta : dict
         Header of the tree's file.
+    planes : CellPlanes
+        What hides surfaces from the data points.
     """
 
     topology: Topology
@@ -63,6 +66,7 @@ class Cell:
     valid: np.ndarray
     payloads: dict[str, payload.Payload]
     meta: dict
+    planes: CellPlanes
 
 
 def cell_path(folder: str | os.PathLike, cell: tuple[int, int], name: str) -> Path:
@@ -92,6 +96,7 @@ def write_cell(
     valid: np.ndarray,
     offsets: np.ndarray,
     meta: dict,
+    planes: CellPlanes | None = None,
 ) -> dict[str, int]:
     """Write all files of a cell, the tree last: a cell without a fitting tree counts as not baked.
 
@@ -109,6 +114,8 @@ def write_cell(
         Data point minus voxel centre, in voxel sizes / 254.
     meta : dict
         Header fields; "bake" identifies what the values depend on.
+    planes : CellPlanes, optional
+        Occluding planes of the data points; none when left out.
 
     Returns
     -------
@@ -123,12 +130,14 @@ def write_cell(
         When a file cannot be written; files written before remain and are overwritten by the next attempt.
     """
     valid, offsets = np.asarray(valid), np.asarray(offsets)
-    _check_cell(topology, payloads, valid, offsets)
+    planes = empty(topology.size) if planes is None else planes
+    _check_cell(topology, payloads, valid, offsets, planes)
     cell, size = topology.cell, topology.size
     common = {"bake": str(meta["bake"]), "cell": list(cell), "topology": topology_hash(topology)}
     sizes = {}
     arrays = {"offset": np.where(valid[:, None], offsets, 0).astype(np.int8), "valid": valid.astype(bool)}
-    units = {"offset": f"voxel size / {OFFSET_STEPS}"}
+    arrays |= {"planes": np.where(valid[:, None], planes.planes, NONE).astype(np.uint16), "plane": planes.plane}
+    units = {"offset": f"voxel size / {OFFSET_STEPS}", "plane": "1, 1, 1, m, m"}
     sizes[POINTS] = container.write(cell_path(folder, cell, POINTS), POINTS, arrays, common, units)
     for name in PAYLOADS:
         path = cell_path(folder, cell, name)
@@ -140,7 +149,7 @@ def write_cell(
     listed = {name: describe_file(cell_path(folder, cell, name)) for name in sizes}
     header = {**meta, **common, "files": listed, "data_points": size, "valid_points": int(valid.sum())}
     header |= {"grid_min": list(topology.grid_min), "grid_shape": list(topology.grid_shape)}
-    header |= {"levels": topology.levels, "left_out": topology.left_out}
+    header |= {"levels": topology.levels, "left_out": topology.left_out, "dilated": topology.dilated}
     nodes = {"mask": topology.nodes["mask"], "link": topology.nodes["link"]}
     sizes[TREE] = container.write(cell_path(folder, cell, TREE), TREE, nodes, header)
     return sizes
@@ -190,7 +199,7 @@ def read_tree(path: str | os.PathLike) -> tuple[Topology, dict]:
     file = container.read(path, TREE)
     try:
         cell, low, shape = (_ints(file.meta[key]) for key in ("cell", "grid_min", "grid_shape"))
-        levels, left_out = _ints([file.meta["levels"], file.meta["left_out"]])
+        levels, left_out, dilated = _ints([file.meta["levels"], file.meta["left_out"], file.meta.get("dilated", 0)])
         mask, link = file.arrays["mask"], file.arrays["link"]
         if (len(cell), len(low), len(shape)) != (2, 3, 3) or mask.ndim != 1 or mask.shape != link.shape:
             raise ValueError("arrays or header fields have a wrong length")
@@ -200,7 +209,7 @@ def read_tree(path: str | os.PathLike) -> tuple[Topology, dict]:
         raise FileError(path, container.PREFIX_BYTES, f"this is no tree: {error}") from None
     nodes = np.zeros(len(mask), NODE)
     nodes["mask"], nodes["link"] = mask, link
-    topology = Topology(cell, low, shape, nodes, levels, left_out)
+    topology = Topology(cell, low, shape, nodes, levels, left_out, dilated)
     defect = validate.first_defect(topology)
     if defect:
         raise FileError(path, container.PREFIX_BYTES, defect)
@@ -243,6 +252,7 @@ def read_cell(folder: str | os.PathLike, cell: tuple[int, int]) -> Cell:
     if shapes != [((topology.size, 3), "|i1"), ((topology.size,), "|b1")]:
         reason = f"the data points do not fit a tree of {topology.size} voxels"
         raise FileError(cell_path(folder, cell, POINTS), container.PREFIX_BYTES, reason)
+    planes = _read_planes(cell_path(folder, cell, POINTS), points.arrays, valid)
     payloads = {}
     for name in (name for name in PAYLOADS if name in meta["files"]):
         payloads[name], header = payload.read_payload(cell_path(folder, cell, name))
@@ -250,7 +260,7 @@ def read_cell(folder: str | os.PathLike, cell: tuple[int, int]) -> Cell:
         if not np.array_equal(payloads[name].index != payload.NO_DATA, valid):
             reason = "the payload has data for other voxels than the valid ones"
             raise FileError(cell_path(folder, cell, name), container.PREFIX_BYTES, reason)
-    return Cell(topology, offset, valid, payloads, meta)
+    return Cell(topology, offset, valid, payloads, meta, planes)
 
 
 def has_cell(folder: str | os.PathLike, cell: tuple[int, int], bake: str) -> bool:
@@ -313,7 +323,22 @@ def _check_belongs(path: Path, meta: dict, own: dict) -> None:
             raise FileError(path, container.PREFIX_BYTES, reason)
 
 
-def _check_cell(topology: Topology, payloads: dict[str, np.ndarray], valid: np.ndarray, offsets: np.ndarray) -> None:
+def _read_planes(path: Path, arrays: dict[str, np.ndarray], valid: np.ndarray) -> CellPlanes:
+    """The planes of a file of data points; those without a data point have none."""
+    if "planes" not in arrays or "plane" not in arrays:
+        raise FileError(path, container.PREFIX_BYTES, "the data points have no occluding planes")
+    planes = CellPlanes(arrays["planes"], arrays["plane"])
+    reason = planes_defect(planes, len(valid))
+    if not reason and (planes.planes[~valid] != NONE).any():
+        reason = "a voxel without a data point has occluding planes"
+    if reason:
+        raise FileError(path, container.PREFIX_BYTES, reason)
+    return planes
+
+
+def _check_cell(
+    topology: Topology, payloads: dict[str, np.ndarray], valid: np.ndarray, offsets: np.ndarray, planes: CellPlanes
+) -> None:
     """Refuse what a reader would refuse, before anything is written."""
     defect = validate.first_defect(topology)
     if defect:
@@ -326,6 +351,9 @@ def _check_cell(topology: Topology, payloads: dict[str, np.ndarray], valid: np.n
         raise ValueError(
             f"valid is {valid.dtype} {valid.shape}, offsets {offsets.dtype} {offsets.shape}; size is {size}"
         )
+    reason = planes_defect(planes, size)
+    if reason:
+        raise ValueError(f"cell {topology.cell}: {reason}")
     for name, values in payloads.items():
         if len(values) != size:
             raise ValueError(f"payload {name} has {len(values)} rows; the tree has {size} voxels")
