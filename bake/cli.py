@@ -172,6 +172,8 @@ def _add_bake(commands) -> None:
     command.add_argument("--quality", choices=tuple(QUALITIES), default="preview")
     command.add_argument("--samples", type=_positive, help="paths per data point, instead of the quality's")
     command.add_argument("--finest", type=float, default=0.0, help="size of the finest voxels in metres")
+    text = "full gives surfaces data of the finest voxels alone: faster to look up, about twice the data"
+    command.add_argument("--dilation", choices=("partial", "full"), default="partial", help=text)
     command.add_argument("--cells", type=_cells, help="only these world cells: 0,1/3,2")
     _add_light(command)
 
@@ -215,6 +217,7 @@ def _add_points(command: argparse.ArgumentParser) -> None:
 def _run_bake(options, extract: Extract, progress: Progress) -> dict:
     samples, bounces = QUALITIES[options.quality]
     settings = _settings(options, options.samples or samples, bounces, options.finest)
+    settings = dataclasses.replace(settings, dilation=options.dilation)
     check_target(options.output)
     snapshot = _read_scene(options.scene, extract, progress)
     outcome = job.bake(snapshot, options.output, settings, options.cells, options.threads, progress)

@@ -42,6 +42,7 @@ class Outcome:
     triangles: int = 0
     cells: int = 0
     data_points: int = 0
+    dilated: int = 0
     bytes: dict[str, int] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     rays: int = 0
@@ -101,7 +102,7 @@ def bake(
     grid = choose_grid(scene.soup.corners, snapshot.origin, settings.finest)
     occupied = [tuple(int(v) for v in cell) for cell in build.occupied_cells(scene.soup.corners, grid)]
     header = _header(snapshot, settings, light, scene, grid, identity) | {"expected_cells": occupied}
-    trees = _build_trees(scene, grid, _wanted(cells, occupied), progress)
+    trees = _build_trees(scene, grid, _wanted(cells, occupied), settings.dilation, progress)
     outcome = _describe(snapshot, light, scene, trees)
     outcome.voxels = {"first": grid.first_size, "finest": float(grid.voxel_size(grid.levels - 1))}
     if not settings.finest and grid.first_size != FIRST_SIZE:
@@ -152,12 +153,14 @@ def _wanted(cells: list[tuple[int, int]] | None, occupied: list[tuple[int, int]]
     return occupied if cells is None else sorted(set(cells))
 
 
-def _build_trees(scene: Scene, grid: Grid, cells: list[tuple[int, int]], progress: Progress) -> list[Topology]:
+def _build_trees(
+    scene: Scene, grid: Grid, cells: list[tuple[int, int]], dilation: str, progress: Progress
+) -> list[Topology]:
     """The voxel tree of every cell."""
     progress.stage("Building trees", len(cells))
     trees = []
     for number, cell in enumerate(cells):
-        trees.append(build.build(scene.soup.corners, grid, cell))
+        trees.append(build.build(scene.soup.corners, grid, cell, dilation=dilation))
         progress.show(number + 1)
     return trees
 
@@ -246,6 +249,7 @@ def _sun_header(snapshot: Snapshot, settings: Settings, light: Model) -> dict:
 def _describe(snapshot: Snapshot, light: Model, scene: Scene, trees: list[Topology]) -> Outcome:
     """Counts, what was modelled, and what was left out and why."""
     outcome = Outcome(len(scene.soup.corners), len(trees), sum(tree.size for tree in trees))
+    outcome.dilated = sum(tree.dilated for tree in trees)
     parts = {
         "local": (scene.has_local, "the scene has no lamps and no emissive surfaces"),
         "sun": (len(light.suns.toward) > 0, "there is no sun, or none was asked for"),

@@ -44,6 +44,7 @@ class Settings:
     sky : "scene", "harmonics", or three numbers with commas: the radiance of a uniform sky
     sun : "scene", "none", "hemisphere", "arc:FILE", or a direction to the sun as x,y,z
     finest : size of the finest voxels [m]; 0 chooses it for the scene
+    dilation : "partial", or "full": surfaces have data of the finest level alone, for about twice the size
     seed : another seed gives independent noise
     """
 
@@ -53,6 +54,7 @@ class Settings:
     sun: str = "scene"
     finest: float = 0.0
     seed: int = 0
+    dilation: str = "partial"
 
 
 def with_sky(snapshot: Snapshot, sky: str) -> tuple[Snapshot, str]:

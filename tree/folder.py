@@ -173,7 +173,7 @@ def _describe_cell(folder: str | os.PathLike, topology: Topology, meta: dict, gr
     listed = meta["files"] | {TREE: describe_file(cell_path(folder, topology.cell, TREE))}
     keys = ("data_points", "valid_points", "left_out")
     entry = {"cell": list(topology.cell), "bounds": [low.tolist(), high.tolist()], "files": listed}
-    return entry | {key: meta[key] for key in keys}
+    return entry | {key: meta[key] for key in keys} | {"dilated": meta.get("dilated", 0)}
 
 
 def _bounds(boxes: list) -> list | None:
