@@ -71,21 +71,22 @@ def succeed(*words: object) -> dict:
 
 
 def yard(cells: int = 1, lamp: bool = True, sun: bool = True, sky=(0.2, 0.3, 0.5), place=(0.0, 0.0, 0.0)) -> Snapshot:
-    """A square of ground with a block on it, once in each of a row of world cells."""
+    """A square of ground with a block on it, once in each of a row of world cells, 6 m from their borders: too
+    far to need the next cells."""
     white = Material("white")
     parts = []
     for number in range(cells):
-        corner = np.array([128.0 * number, 0, 0])
+        corner = np.array([128.0 * number + 4, 4, 0])
         parts.append((build_scenes.plane(6.0) + corner + (8, 8, 0), white))
         parts.append((build_scenes.box((6, 6, 0), (8, 8, 2)) + corner, white))
     rows = []
     if lamp:
-        rows.append({"position": np.array([9, 9, 3.0]) + place, "strength": (10, 9, 8), "size": (0.1, 0)})
+        rows.append({"position": np.array([13, 13, 3.0]) + place, "strength": (10, 9, 8), "size": (0.1, 0)})
     if sun:
         frame = build_scenes.sun_frame(SUN)
         rows.append({"kind": LightKind.SUN, "frame": frame, "strength": (5, 5, 4), "size": (0.01, 0)})
     made = build_scenes.snapshot(parts, build_scenes.lamps(*rows), sky, place)
-    eye = np.concatenate([np.eye(3), np.array([[8.0], [8.0], [20.0]]) + np.reshape(place, (3, 1))], axis=1)
+    eye = np.concatenate([np.eye(3), np.array([[12.0], [12.0], [20.0]]) + np.reshape(place, (3, 1))], axis=1)
     return dataclasses.replace(made, cameras=(Camera("above", tuple(eye.ravel().tolist()), 0.5),))
 
 
@@ -115,8 +116,8 @@ def cells_only(folder: Path) -> dict[str, bytes]:
 def ground_points(count: int = 40, place=(0.0, 0.0, 0.0)) -> tuple[np.ndarray, np.ndarray]:
     """Points on the yard's ground that are not under its block, and their normals."""
     rng = np.random.default_rng(5)
-    points = np.concatenate([rng.uniform(3, 13, (4 * count, 2)), np.zeros((4 * count, 1))], axis=1)
-    outside = (np.abs(points[:, :2] - 7) > 1.2).any(axis=1)
+    points = np.concatenate([rng.uniform(7, 17, (4 * count, 2)), np.zeros((4 * count, 1))], axis=1)
+    outside = (np.abs(points[:, :2] - 11) > 1.2).any(axis=1)
     points = points[outside][:count]
     return points + place, np.tile([0.0, 0.0, 1.0], (len(points), 1))
 
