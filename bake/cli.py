@@ -18,11 +18,12 @@ from pathlib import Path
 from typing import TextIO
 
 from ..tree import container, verify, world
+from ..tree.topology import MAX_POINTS
 from . import job, reference, snapshot_file
 from .arrays import check_output, one_line, read_points, write_array
 from .place import SNAPSHOT_NAME, check_target, scene_defects
 from .progress import Progress
-from .settings import QUALITIES, Settings, SettingsError, has_free_sun, numbers, of_reference, unit
+from .settings import ERRORS, QUALITIES, Settings, SettingsError, has_free_sun, numbers, of_reference, unit
 from .snapshot import Snapshot, SnapshotError
 
 EXPECTED = (SnapshotError, SettingsError, container.FileError, OSError, ValueError, MemoryError)
@@ -172,6 +173,11 @@ def _add_bake(commands) -> None:
     command.add_argument("--quality", choices=tuple(QUALITIES), default="preview")
     command.add_argument("--samples", type=_positive, help="paths per data point, instead of the quality's")
     command.add_argument("--finest", type=float, default=0.0, help="size of the finest voxels in metres")
+    text = "subdivide where the relative error of surface irradiance is above this; 0: wherever geometry is not flat"
+    command.add_argument("--error", type=_error, help=text)
+    text = "most data points of a world cell"
+    command.add_argument("--max-points", type=_points, default=MAX_POINTS, help=text)
+    command.add_argument("--no-fit", action="store_true", help="keep data points as traced, not fitted to surfaces")
     text = "full gives surfaces data of the finest voxels alone: faster to look up, about twice the data"
     command.add_argument("--dilation", choices=("partial", "full"), default="partial", help=text)
     command.add_argument("--cells", type=_cells, help="only these world cells: 0,1/3,2")
@@ -217,7 +223,9 @@ def _add_points(command: argparse.ArgumentParser) -> None:
 def _run_bake(options, extract: Extract, progress: Progress) -> dict:
     samples, bounces = QUALITIES[options.quality]
     settings = _settings(options, options.samples or samples, bounces, options.finest)
-    settings = dataclasses.replace(settings, dilation=options.dilation)
+    error = ERRORS[options.quality] if options.error is None else options.error
+    own = {"error": error, "max_points": options.max_points, "fit": not options.no_fit, "dilation": options.dilation}
+    settings = dataclasses.replace(settings, **own)
     check_target(options.output)
     snapshot = _read_scene(options.scene, extract, progress)
     outcome = job.bake(snapshot, options.output, settings, options.cells, options.threads, progress)
@@ -335,6 +343,25 @@ def _natural(text: str) -> int:
 
 def _positive(text: str) -> int:
     return _whole(text, 1)
+
+
+def _points(text: str) -> int:
+    """A cap that a cell's index can number."""
+    value = _whole(text, 1)
+    if value > MAX_POINTS:
+        raise argparse.ArgumentTypeError(f"{text!r}: a world cell holds at most {MAX_POINTS} data points")
+    return value
+
+
+def _error(text: str) -> float:
+    """A relative error, 0 to 1."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 <= value <= 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number from 0 to 1")
+    return value
 
 
 def _whole(text: str, least: int) -> int:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,22 +18,28 @@ import numpy as np
 
 from ..tree import build, folder
 from ..tree.grid import FIRST_SIZE, Grid
+from ..tree.outline import outline
+from ..tree.planes import of_cell
 from ..tree.topology import Topology
-from . import datapoints, snapshot_file
-from .gather import CancelledError, Effort, Gathered, gather
+from . import snapshot_file
+from .gather import CancelledError, Effort
+from .measured import split
 from .place import Place, check_target
 from .progress import Progress
 from .reference import sun_strength
+from .refine import Judge, Target, fitted, refine
 from .scene import Model, Scene, prepare, scene_suns
-from .sensors import HarmonicsSensor
-from .settings import Settings, SettingsError, check_scene, check_triangles, choose_grid, has_free_sun, model
+from .settings import LEVELS, Settings, SettingsError, check_scene, check_triangles, choose_grid, has_free_sun, model
 from .snapshot import Snapshot
 
-FORMAT = "gi_volumes bake 1"
+FORMAT = "gi_volumes bake 2"
 """Part of every bake's hash: files of another definition are baked anew."""
 
 LISTED = 12
 """Cells that a message names."""
+
+STEPS = 1000
+"""Units of progress in a cell."""
 
 
 @dataclass
@@ -99,22 +106,27 @@ def bake(
     identity = bake_hash(effective, settings, light)
     scene = prepare(effective, light)
     check_triangles(scene.soup.corners)
-    grid = choose_grid(scene.soup.corners, snapshot.origin, settings.finest)
+    levels = LEVELS if settings.error else LEVELS - 1
+    grid = choose_grid(scene.soup.corners, snapshot.origin, settings.finest, levels)
     occupied = [tuple(int(v) for v in cell) for cell in build.occupied_cells(scene.soup.corners, grid)]
     header = _header(snapshot, settings, light, scene, grid, identity) | {"expected_cells": occupied}
-    trees = _build_trees(scene, grid, _wanted(cells, occupied), settings.dilation, progress)
+    wanted = _wanted(cells, occupied)
+    place = Place(target, snapshot, header)
+    effort = Effort(settings.samples, settings.bounces, settings.seed, threads)
+    goal = Target(settings.error, settings.max_points, settings.dilation, effort, settings.receiver_samples)
+    try:
+        trees = _bake_cells(
+            _Work(scene, grid, place, settings, _judge(snapshot, settings, scene), goal), wanted, progress
+        )
+        place.take()
+    finally:
+        listed = place.close()
     outcome = _describe(snapshot, light, scene, trees)
     outcome.voxels = {"first": grid.first_size, "finest": float(grid.voxel_size(grid.levels - 1))}
     if not settings.finest and grid.first_size != FIRST_SIZE:
         outcome.warnings.append(
             f"first-level voxels of {grid.first_size:g} m suit this scene's size; --finest changes it"
         )
-    place = Place(target, snapshot, header)
-    try:
-        _bake_cells(scene, grid, trees, place, settings, threads, progress)
-        place.take()
-    finally:
-        listed = place.close()
     if len(listed) < len(occupied):
         outcome.warnings.append(f"{len(occupied) - len(listed)} of the scene's {len(occupied)} cells are not baked yet")
     outcome.seconds = progress.seconds
@@ -153,60 +165,57 @@ def _wanted(cells: list[tuple[int, int]] | None, occupied: list[tuple[int, int]]
     return occupied if cells is None else sorted(set(cells))
 
 
-def _build_trees(
-    scene: Scene, grid: Grid, cells: list[tuple[int, int]], dilation: str, progress: Progress
-) -> list[Topology]:
-    """The voxel tree of every cell."""
-    progress.stage("Building trees", len(cells))
+@dataclass(frozen=True, eq=False)
+class _Work:
+    """What all cells of a bake share."""
+
+    scene: Scene
+    grid: Grid
+    place: Place
+    settings: Settings
+    judge: Judge
+    target: Target
+
+
+def _judge(snapshot: Snapshot, settings: Settings, scene: Scene) -> Judge:
+    """Local light, sun and sky as they are when nobody says otherwise; of a free sun the mean of its directions."""
+    suns = len(scene.model.suns.toward)
+    strength = sun_strength(snapshot, suns) / (max(suns, 1) if has_free_sun(settings.sun) else 1)
+    sky = scene.sky.harmonics() if scene.model.sky == "harmonics" else np.ones((scene.model.sky_count, 3))
+    parts = [np.ones((int(scene.has_local), 3)), strength if suns else np.zeros((0, 3)), sky]
+    mean, ends = np.concatenate(parts), np.cumsum([len(part) for part in parts])
+    views = [
+        np.where((np.arange(len(mean)) < end) & (np.arange(len(mean)) >= end - len(part)), 1.0, 0.0)[:, None] * mean
+        for part, end in zip(parts, ends, strict=True)
+        if len(part)
+    ]
+    return Judge(np.array(views).reshape(-1, len(mean), 3), mean)
+
+
+def _bake_cells(work: _Work, cells: list[tuple[int, int]], progress: Progress) -> list[Topology]:
+    """Cell after cell; the ones already there are only read."""
+    progress.stage("Baking", STEPS * len(cells))
     trees = []
     for number, cell in enumerate(cells):
-        trees.append(build.build(scene.soup.corners, grid, cell, dilation=dilation))
-        progress.show(number + 1)
+        done = STEPS * number
+        if folder.has_cell(work.place.target, cell, work.place.identity):
+            trees.append(folder.read_cell(work.place.target, cell).topology)
+        else:
+            trees.append(_bake_cell(work, cell, lambda share, d=done: progress.show(d + int(share * STEPS))))
+        progress.show(done + STEPS)
     return trees
 
 
-def _bake_cells(scene, grid, trees: list[Topology], place: Place, settings, threads, progress: Progress) -> None:
-    """Cell after cell; the ones already there are only counted."""
-    missing = [tree for tree in trees if not folder.has_cell(place.target, tree.cell, place.identity)]
-    total = sum(tree.size for tree in trees)
-    done = total - sum(tree.size for tree in missing)
-    progress.stage("Baking", total, done)
-    for tree in missing:
-        _bake_cell(scene, grid, tree, place, settings, threads, lambda n, d=done: progress.show(d + n))
-        done += tree.size
-        progress.show(done)
-
-
-def _bake_cell(scene, grid: Grid, tree: Topology, place: Place, settings: Settings, threads, show) -> None:
-    """Place the data points of one cell, gather their light, write its files."""
-    level, coords = tree.voxels()
-    size = np.asarray(grid.voxel_size(level.astype(np.int64)), np.float64)
-    key = datapoints.keys(level, coords)
-    placed = datapoints.place(scene, grid.centers(level, coords), size, key, threads)
-    rows = np.flatnonzero(placed.valid)
-    order = rows[datapoints.morton_order(placed.position[:, rows])]
-    effort = Effort(settings.samples, settings.bounces, settings.seed, threads)
-    position = np.ascontiguousarray(placed.position[:, order])
-    found = gather(scene, HarmonicsSensor(), position, key[order], effort, show)
-    payloads = {name: _spread(values, order, tree.size) for name, values in _payloads(found)}
-    place.write_cell(tree, payloads, placed.valid, placed.offset)
-
-
-def _payloads(found: Gathered):
-    """(name, (points, functions, 9, 3) values) of each transport that is modelled."""
-    if len(found.local):
-        yield "local", found.local[:, None]
-    if len(found.sun):
-        yield "sun", found.sun
-    if len(found.sky):
-        yield "sky", found.sky
-
-
-def _spread(values: np.ndarray, rows: np.ndarray, size: int) -> np.ndarray:
-    """Values of the valid points at their places in the index space; zeros elsewhere."""
-    out = np.zeros((size, *values.shape[1:]), np.float32)
-    out[rows] = values
-    return out
+def _bake_cell(work: _Work, cell: tuple[int, int], show: Callable[[float], bool]) -> Topology:
+    """Grow the tree of one cell, measure and fit its light, write its files."""
+    found = outline(work.scene.soup.corners, work.grid, cell)
+    refined = refine(work.scene, work.grid, found, work.judge, work.target, show)
+    light = fitted(refined, work.target.effort.threads) if work.settings.fit else refined.measured.light
+    tree, measured, data = refined.tree, refined.measured, refined.data
+    corner = np.array([*cell, 0]) * work.grid.cell_size
+    planes = of_cell(data.planes, data.plane, data.position, corner)
+    work.place.write_cell(tree, split(work.scene, light), measured.valid, measured.offset, planes)
+    return tree
 
 
 def _header(snapshot: Snapshot, settings: Settings, light: Model, scene: Scene, grid: Grid, identity: str) -> dict:

@@ -26,6 +26,7 @@ def at(
     normals: np.ndarray,
     effort: Effort,
     progress: Callable[[int], bool] | None = None,
+    keys: np.ndarray | None = None,
 ) -> Gathered:
     """Trace every modelled transport at surface points.
 
@@ -41,6 +42,8 @@ def at(
         Samples, bounces, seed.
     progress : callable, optional
         As in `gather.gather`.
+    keys : (n,) uint32 ndarray, optional
+        Random key of each point; by its number when left out.
 
     Returns
     -------
@@ -50,7 +53,8 @@ def at(
     normal = np.ascontiguousarray(np.asarray(normals, np.float32).T)
     local = np.ascontiguousarray((np.asarray(points, np.float64) - scene.origin).T.astype(np.float32))
     position = local + normal * (START * scene.tracer.offset(local, np.zeros(local.shape[1], np.float32)))
-    keys = scramble(np.arange(len(points), dtype=np.uint32), 0x5EED)
+    if keys is None:
+        keys = scramble(np.arange(len(points), dtype=np.uint32), 0x5EED)
     return gather(scene, SurfaceSensor(normal), position, keys, effort, progress)
 
 

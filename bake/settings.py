@@ -16,14 +16,24 @@ import numpy as np
 from ..tree import grid as lattice
 from ..tree.grid import Grid
 from ..tree.suns import MAX_KEYS
+from ..tree.topology import MAX_POINTS
 from .scene import Model, SunDirections, scene_suns
 from .snapshot import Snapshot, SnapshotError
 
 QUALITIES = {"draft": (64, 6), "preview": (256, 8), "final": (1024, 12)}
 """(paths per data point, bounces) by name; doubling the paths takes about a third off the noise."""
 
+ERRORS = {"draft": 0.2, "preview": 0.1, "final": 0.05}
+"""Relative error of surface irradiance above which a voxel is subdivided, by name of the quality."""
+
+RECEIVER_SHARE = 4
+"""A receiver has a fourth of a data point's paths: there are more of them, and they agree on what they fit."""
+
 HEMISPHERE_KEYS = 16
 """Directions of a free sun."""
+
+LEVELS = 4
+"""Levels of voxels that light may ask for: 8, 2, 0.5 and 0.125 m at human scale."""
 
 MOST_LEVELS = 5
 """Levels of voxels that --finest may ask for: 256 voxels along the edge of a first-level one."""
@@ -46,6 +56,9 @@ class Settings:
     finest : size of the finest voxels [m]; 0 chooses it for the scene
     dilation : "partial", or "full": surfaces have data of the finest level alone, for about twice the size
     seed : another seed gives independent noise
+    error : relative error of surface irradiance above which a voxel is subdivided; 0: wherever geometry is not flat
+    max_points : most data points of a world cell
+    fit : whether data points are fitted to what surfaces see of them
     """
 
     samples: int = QUALITIES["preview"][0]
@@ -55,6 +68,14 @@ class Settings:
     finest: float = 0.0
     seed: int = 0
     dilation: str = "partial"
+    error: float = ERRORS["preview"]
+    max_points: int = MAX_POINTS
+    fit: bool = True
+
+    @property
+    def receiver_samples(self) -> int:
+        """Paths per receiver: an even number, as errors are measured by two independent halves."""
+        return max(2, self.samples // RECEIVER_SHARE // 2 * 2)
 
 
 def with_sky(snapshot: Snapshot, sky: str) -> tuple[Snapshot, str]:
@@ -238,7 +259,7 @@ def hemisphere(count: int) -> np.ndarray:
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
 
 
-def choose_grid(corners: np.ndarray, origin: np.ndarray, finest: float) -> Grid:
+def choose_grid(corners: np.ndarray, origin: np.ndarray, finest: float, levels: int = LEVELS) -> Grid:
     """Sizes of the voxels.
 
     Parameters
@@ -249,6 +270,8 @@ def choose_grid(corners: np.ndarray, origin: np.ndarray, finest: float) -> Grid:
         The snapshot's origin [m].
     finest : float
         Size of the finest voxels [m]; 0 chooses it for the scene.
+    levels : int
+        Levels of a lattice that is chosen for the scene.
 
     Returns
     -------
@@ -260,7 +283,7 @@ def choose_grid(corners: np.ndarray, origin: np.ndarray, finest: float) -> Grid:
     SettingsError
         The size is not a power of two, or far from the scene's own scale.
     """
-    grid = lattice.choose(corners, origin=tuple(origin))
+    grid = lattice.choose(corners, levels, tuple(origin))
     if not finest:
         return grid
     if not (math.isfinite(finest) and finest > 0 and math.frexp(finest)[0] == 0.5):

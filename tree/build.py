@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from . import bits
-from .dilate import BESIDE_FULL, DILATIONS, dilate
+from .dilate import BESIDE_FULL, DILATIONS, dilate, own
 from .first_level import occupied_cells
 from .grid import BRANCH, Grid
 from .need import FLAT
@@ -106,7 +106,11 @@ def grow(
 
 
 def fit(
-    outline: Outline, need: Sequence[np.ndarray], dilation: str = "partial", max_points: int = MAX_POINTS
+    outline: Outline,
+    need: Sequence[np.ndarray],
+    dilation: str = "partial",
+    max_points: int = MAX_POINTS,
+    asked: Sequence[np.ndarray] | None = None,
 ) -> Topology:
     """Build the tree of the neediest candidates that fit under a cap.
 
@@ -121,6 +125,9 @@ def fit(
         As for `grow`.
     max_points : int
         Cap on the number of data points, dilation included; more than `MAX_POINTS` is cut to it.
+    asked : sequence of (b, 3) int64, optional
+        For each level voxels that are wanted by themselves, solid or not: in front of thin surfaces, for example.
+        Those outside of the cell do not count; those of the first level are there anyway.
 
     Returns
     -------
@@ -136,7 +143,7 @@ def fit(
     for level in range(1, len(need)):
         need[level] = np.minimum(need[level], need[level - 1][outline.parent[level]])
     chosen = _descendants(outline, [values > 0 for values in need])
-    order = _Order(outline, chosen, need, [np.zeros(len(values)) for values in need])
+    order = _Order(outline, chosen, need, [np.zeros(len(values)) for values in need], asked)
     return _largest(outline, order, dilation, min(max_points, MAX_POINTS))
 
 
@@ -163,7 +170,15 @@ def _descendants(outline: Outline, masks: Sequence[np.ndarray]) -> list[np.ndarr
 class _Order:
     """Candidates of all levels, first come first served, and what each would add."""
 
-    def __init__(self, outline: Outline, chosen: list[np.ndarray], first: list[np.ndarray], then: Sequence[np.ndarray]):
+    def __init__(
+        self,
+        outline: Outline,
+        chosen: list[np.ndarray],
+        first: list[np.ndarray],
+        then: Sequence[np.ndarray],
+        asked: Sequence[np.ndarray] | None = None,
+    ):
+        self.asked = asked
         rows = [np.flatnonzero(mask) for mask in chosen]
         level = np.repeat(np.arange(len(rows)), [len(part) for part in rows])
 
@@ -200,13 +215,13 @@ def _largest(outline: Outline, order: _Order, dilation: str, max_points: int) ->
         raise ValueError(f"dilation {dilation!r}; use one of {', '.join(DILATIONS)}")
     room = max_points - int(np.prod(outline.dense.shape))
     many = int(np.searchsorted(order.solid, room, side="right")) - 1
-    found = _voxels(outline, order.divided(many), dilation)
+    found = _voxels(outline, order.divided(many), dilation, order.asked)
     few = many if _count(found) <= room else 0
     if few < many or _count(found) > room:
         dilation, found = _least(outline, order, dilation, room)
     while order.solid[many] - order.solid[few] > CLOSE * max_points and many - few > 1:
         middle = (few + many) // 2
-        tried = _voxels(outline, order.divided(middle), dilation)
+        tried = _voxels(outline, order.divided(middle), dilation, order.asked)
         if _count(tried) <= room:
             few, found = middle, tried
         else:
@@ -223,11 +238,15 @@ def _least(outline: Outline, order: _Order, dilation: str, room: int) -> tuple[s
     return "none", _voxels(outline, order.divided(0), "none")
 
 
-def _voxels(outline: Outline, divided: list[np.ndarray], dilation: str) -> list[np.ndarray]:
+def _voxels(
+    outline: Outline, divided: list[np.ndarray], dilation: str, asked: Sequence[np.ndarray] | None = None
+) -> list[np.ndarray]:
     """All voxels below the dense grid when some are subdivided."""
     solid = [outline.coords[0]]
     for level, mask in enumerate(divided):
         solid.append(outline.coords[level + 1][mask[outline.parent[level + 1]]])
+        if asked is not None:
+            solid[-1] = own(outline, level + 1, np.concatenate([solid[-1], asked[level + 1]]))
     return dilate(outline, solid, dilation)
 
 

@@ -51,12 +51,34 @@ def dilate(outline: Outline, solid: list[np.ndarray], dilation: str) -> list[np.
         return voxels
     others = _others(outline, dilation)
     if dilation == "full":
-        voxels[finest] = _own(outline, finest, _neighbours(np.concatenate([solid[finest], outline.border[finest]])))
+        voxels[finest] = own(outline, finest, _neighbours(np.concatenate([solid[finest], outline.border[finest]])))
     for level in range(finest, 1, -1):
         asked = _asked(voxels[level], others[level], 1 if level == finest else 2)
         asked = np.concatenate([asked, voxels[level] // BRANCH, solid[level - 1]])
-        voxels[level - 1] = _own(outline, level - 1, asked)
+        voxels[level - 1] = own(outline, level - 1, asked)
     return voxels
+
+
+def own(outline: Outline, level: int, coords: np.ndarray) -> np.ndarray:
+    """Return each voxel that lies in the cell's dense grid once; there are no others.
+
+    Parameters
+    ----------
+    outline : Outline
+        The cell.
+    level : int
+        Level of the voxels.
+    coords : (n, 3) int64
+        Voxels, also outside of the cell, also more than once.
+
+    Returns
+    -------
+    (m, 3) int64
+        Sorted by z, y, x.
+    """
+    scale = BRANCH**level
+    inside = Region(outline.dense.low * scale, outline.dense.shape * scale).contains(coords)
+    return _once(coords[inside])
 
 
 def _others(outline: Outline, dilation: str) -> list[np.ndarray]:
@@ -73,13 +95,6 @@ def _others(outline: Outline, dilation: str) -> list[np.ndarray]:
     widths = [CELL_VOXELS * BRANCH**level for level in range(finest + 1)]
     homes = [coords[:, :2] // width for coords, width in zip(possible, widths, strict=True)]
     return [coords[(home != outline.cell).any(axis=1)] for coords, home in zip(possible, homes, strict=True)]
-
-
-def _own(outline: Outline, level: int, coords: np.ndarray) -> np.ndarray:
-    """Each voxel of the cell's dense grid once; there are no others."""
-    scale = BRANCH**level
-    inside = Region(outline.dense.low * scale, outline.dense.shape * scale).contains(coords)
-    return _once(coords[inside])
 
 
 def _once(coords: np.ndarray) -> np.ndarray:

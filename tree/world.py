@@ -12,7 +12,7 @@ import os
 
 import numpy as np
 
-from . import folder, harmonics
+from . import folder, harmonics, planes
 from .blend import blend, clamp
 from .container import FileError
 from .grid import Grid
@@ -242,7 +242,9 @@ def _data_points(grid: Grid, cells: list[folder.Cell]) -> DataPoints:
     """Join the data points of all cells."""
     offset = np.concatenate([np.zeros((0, 3), np.int8), *(cell.offset for cell in cells)])
     valid = np.concatenate([np.zeros(0, bool), *(cell.valid for cell in cells)])
-    return join(grid, [cell.topology for cell in cells], offset, valid)
+    corners = np.array([[*cell.topology.cell, 0] for cell in cells], np.float64).reshape(-1, 3) * grid.cell_size
+    occluders = planes.join([cell.planes for cell in cells], corners)
+    return join(grid, [cell.topology for cell in cells], offset, valid, *occluders)
 
 
 def _join(name: str, cells: list[folder.Cell], atlas: Atlas) -> Values:
