@@ -24,29 +24,15 @@ SAME = 4e-4
 
 
 @dataclass(frozen=True)
-class Planes:
-    """Planes of blockers, without orientation.
-
-    normal : (q, 3) float64, unit length
-    distance : (q,) float64 [m], normal . p of the points p on the plane, relative to the scene's origin
-    """
-
-    normal: np.ndarray
-    distance: np.ndarray
-
-
-@dataclass(frozen=True)
 class Candidates:
     """Planes to try for data points; sorted by data point, then the most promising first.
 
     point : (c,) int64, row of the data points
-    plane : (c,) int64, row of the planes
-    side : (c,) float64, 1 or -1: the plane's normal times this points to the data point
+    plane : (c, 4) float64, unit normal towards the data point, and the distance along it [m]
     """
 
     point: np.ndarray
     plane: np.ndarray
-    side: np.ndarray
 
     def take(self, rows: np.ndarray) -> Candidates:
         """Some of them.
@@ -61,12 +47,10 @@ class Candidates:
         Candidates
             In the order of `rows`.
         """
-        return Candidates(self.point[rows], self.plane[rows], self.side[rows])
+        return Candidates(self.point[rows], self.plane[rows])
 
 
-def find(
-    scene: Scene, pairs: Pairs, weight: np.ndarray, position: np.ndarray, finest: float
-) -> tuple[Planes, Candidates]:
+def find(scene: Scene, pairs: Pairs, weight: np.ndarray, position: np.ndarray, finest: float) -> Candidates:
     """Find the planes that stand between data points and receivers.
 
     Parameters
@@ -84,9 +68,7 @@ def find(
 
     Returns
     -------
-    planes : Planes
-        Of all blocking triangles.
-    candidates : Candidates
+    Candidates
         At most `CANDIDATES` a data point; none that a data point lies on.
     """
     hidden = np.flatnonzero(~pairs.visible)
@@ -95,24 +77,26 @@ def find(
     plane = plane[place.reshape(-1, 2)]
     both = plane[:, 1] != plane[:, 0]
     point = np.concatenate([pairs.point[hidden], pairs.point[hidden][both]])
-    code = point * len(planes.distance) + np.concatenate([plane[:, 0], plane[both, 1]])
+    code = point * max(len(planes), 1) + np.concatenate([plane[:, 0], plane[both, 1]])
     code, place = np.unique(code, return_inverse=True)
     sums = np.bincount(place.reshape(-1), np.concatenate([weight[hidden], weight[hidden][both]]), len(code))
-    point, plane = np.divmod(code, max(len(planes.distance), 1))
-    height = (planes.normal[plane] * position[point]).sum(axis=1) - planes.distance[plane]
-    kept = (np.abs(height) > SAME * finest) & np.isfinite(height)
-    point, plane, side, sums = point[kept], plane[kept], np.sign(height[kept]), sums[kept]
+    point, row = np.divmod(code, max(len(planes), 1))
+    height = (planes[row, :3] * position[point]).sum(axis=1) - planes[row, 3]
     order = np.lexsort((-sums, point))
-    rank = np.arange(len(order)) - np.searchsorted(point[order], point[order])
-    return planes, Candidates(point, plane, side).take(order[rank < CANDIDATES])
+    order = order[(np.abs(height) > SAME * finest)[order]]
+    order = order[np.arange(len(order)) - np.searchsorted(point[order], point[order]) < CANDIDATES]
+    return Candidates(point[order], planes[row[order]] * np.sign(height[order])[:, None])
 
 
-def _merge(triangles: np.ndarray, finest: float) -> tuple[Planes, np.ndarray]:
-    """Distinct planes of triangles, each through the largest of its triangles, and the plane of each triangle."""
+def _merge(triangles: np.ndarray, finest: float) -> tuple[np.ndarray, np.ndarray]:
+    """(q, 4) distinct planes of triangles, each through the largest of its triangles, and the plane of each triangle.
+
+    Normals point along their largest component's axis, so that front and back have one plane; a triangle without
+    area has a normal of 0, which no data point lies above.
+    """
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     area = np.sqrt((cross * cross).sum(axis=1))
     normal = cross / np.maximum(area, 1e-300)[:, None]
-    normal[area == 0] = np.nan
     largest = np.abs(normal).argmax(axis=1)
     normal *= np.where(normal[np.arange(len(normal)), largest] < 0, -1.0, 1.0)[:, None]
     middle = triangles.mean(axis=1)
@@ -120,8 +104,9 @@ def _merge(triangles: np.ndarray, finest: float) -> tuple[Planes, np.ndarray]:
     above = (normal * (middle - block * (BLOCK * finest))).sum(axis=1) / finest
     code = np.concatenate([block, np.round(normal / SAME), np.round(above / SAME)[:, None]], axis=1)
     order = np.argsort(-area, kind="stable")
-    _, first, place = np.unique(np.nan_to_num(code[order]), axis=0, return_index=True, return_inverse=True)
+    _, first, place = np.unique(code[order], axis=0, return_index=True, return_inverse=True)
     plane = np.empty(len(order), np.int64)
     plane[order] = place.reshape(-1)
     rows = order[first]
-    return Planes(normal[rows], (normal[rows] * middle[rows]).sum(axis=1)), plane
+    distance = (normal[rows] * middle[rows]).sum(axis=1)
+    return np.concatenate([normal[rows], distance[:, None]], axis=1), plane

@@ -2,16 +2,18 @@
 
 Comes in: a scene, data points, receivers. Goes out: one pair for each receiver and data point that matters to it, with
 the opaque triangles that block it, seen from either end. Transparent surfaces hide nothing, as for shadow rays.
+Receivers that see too little of their stencil will be lit by coarser levels, so they have pairs with those too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..tree import interpolate
+from ..tree.blend import ENOUGH
 from .gather import TILE_LANES, run_tiles
 from .rays import MISS
 from .receivers import Receivers, lifted
@@ -98,23 +100,32 @@ def look(
     data, found = replace(data, planes=np.full_like(data.planes, -1)), {}
 
     def work(rows: np.ndarray) -> int:
-        part = receivers.take(rows)
-        receiver, point, weight = _taps(data, part)
-        start = np.ascontiguousarray(lifted(scene, part)[:, receiver])
-        blocker = _blockers(scene, start, data.position[point].T.astype(np.float32))
-        found[int(rows[0])] = Pairs(rows[receiver], point, weight, blocker)
+        found[int(rows[0])] = _join([*_levels(scene, data, receivers.take(rows), rows)])
         return len(rows)
 
     count, step = len(receivers.key), TILE_LANES // TAPS
     run_tiles(work, [np.arange(a, min(a + step, count)) for a in range(0, count, step)], threads, progress)
-    return _sorted([found[first] for first in sorted(found)])
+    pairs = _join([found[first] for first in sorted(found)])
+    return pairs.take(np.lexsort((pairs.receiver, pairs.point)))
 
 
-def _taps(data: interpolate.DataPoints, receivers: Receivers):
+def _levels(scene: Scene, data: interpolate.DataPoints, receivers: Receivers, rows: np.ndarray) -> Iterator[Pairs]:
+    """Pairs of the whole stencil, then for receivers that see too little of it those of the next coarser one."""
+    seen = np.zeros(len(rows))
+    for finest in range(data.grid.levels - 1, -1, -1):
+        low = np.flatnonzero(seen < ENOUGH)
+        receiver, point, weight = _taps(data, receivers.take(low), finest)
+        start = np.ascontiguousarray(lifted(scene, receivers)[:, low[receiver]])
+        blocker = _blockers(scene, start, data.position[point].T.astype(np.float32))
+        seen[low] += np.bincount(receiver, weight * (blocker[:, 0] == MISS), len(low))
+        yield Pairs(rows[low[receiver]], point, weight, blocker)
+
+
+def _taps(data: interpolate.DataPoints, receivers: Receivers, finest: int):
     """(receiver, point, weight) of the taps that matter."""
     position, normal = (np.ascontiguousarray(column.T) for column in (receivers.position, receivers.normal))
     parts = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.float32))]
-    for taps in interpolate.layers(data, position, normal):
+    for taps in interpolate.layers(data, position, normal, finest):
         corner, column = np.nonzero(taps.weight > NEGLIGIBLE)
         parts.append((taps.point[column], taps.row[corner, column].astype(np.int64), taps.weight[corner, column]))
     return (np.concatenate(columns) for columns in zip(*parts, strict=True))
@@ -137,9 +148,8 @@ def _first(scene: Scene, origin: np.ndarray, way: np.ndarray) -> np.ndarray:
     return scene.tracer.intersect_opaque(origin, way, far).triangle.astype(np.int32)
 
 
-def _sorted(parts: list[Pairs]) -> Pairs:
-    """All pairs, by data point; those of a data point stay in the order of the receivers."""
+def _join(parts: list[Pairs]) -> Pairs:
+    """All pairs."""
     empty = Pairs(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.float32), np.zeros((0, 2), np.int32))
     names = ("receiver", "point", "weight", "blocker")
-    pairs = Pairs(*(np.concatenate([getattr(part, name) for part in (empty, *parts)]) for name in names))
-    return pairs.take(np.argsort(pairs.point, kind="stable"))
+    return Pairs(*(np.concatenate([getattr(part, name) for part in (empty, *parts)]) for name in names))
