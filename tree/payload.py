@@ -31,10 +31,9 @@ KIND = "payload"
 VERSION = 2
 NO_DATA = 0xFFFF
 """Index of a voxel without data."""
-GOALS = {"local": Goal(0.02, 8, 12), "sun": Goal(0.05, 8, 56), "sky": Goal(0.05, 8, 28)}
-"""Root mean square relative errors of entries that add less than 1 % to irradiance, and sizes that keep all three
-within 100 bytes of a data point; `docs/accuracy.md` has the curves. Errors of sun and sky spread over 16 and 9
-functions, of which one light uses a few."""
+GOALS = {"local": Goal(0.01, 8, 9), "sun": Goal(0.02, 8, 58), "sky": Goal(0.02, 8, 26)}
+"""Root mean square relative errors of entries, and the bytes of an entry that may be spent on them: all three stay
+within 100 bytes of a data point, shared out so that another byte would help each as much; `docs/accuracy.md`."""
 SKY_GAIN = (0, 1, 1, 1, 2, 2, 2, 2, 2)
 """Octaves by which the response to a sky's harmonic may be less exact: skies have half as much of the order 1 as of the
 order 0, and a quarter of the order 2."""

@@ -24,12 +24,12 @@ WIDTH = 27
 """Numbers of each function: 9 harmonics, 3 colours."""
 FINEST, COARSEST = 1.0 / 1024, 0.5
 """Errors that may be asked for; below the first, float16 would be smaller."""
-STEPS = 2.0 ** (-1 - np.arange(53) / 4)
+STEPS = 2.0 ** (-1 - np.arange(105) / 8)
 """Steps of coefficients that are tried; the last, 2**-14, keeps them within 16 bits."""
 ROW_BITS = 16
 """Fraction bits of rows in sums of products: up to 2**14 rows stay below 2**53 and are exact in any order."""
-FITTED_ROWS = 1 << 14
-"""Most rows that a basis is fitted to; more are thinned out evenly."""
+FITTED_ROWS = 1 << 13
+"""Most rows that the basis and the steps are fitted to; more are thinned out evenly."""
 KEPT = 0.5
 """A direction of the basis is kept where its variance exceeds this times the squared step: below, zstd's least of one
 bit for a symbol costs more than it gains. Measured between 1/12 and 0.8, see `docs/accuracy.md`."""
@@ -39,7 +39,7 @@ FINEST_BASIS = 2.0**-15
 """Finest step of the basis, whose numbers are at most 1 and have 16 bits."""
 BYTE = 256
 """A coefficient of 16 bits is stored as two of 8 bits, with the same row of the basis: no second type is needed."""
-ENTROPY_CODED = 1.25
+ENTROPY_CODED = 1.2
 """Bytes that zstd's Huffman codes take, of columns together, relative to the entropy of each."""
 CHUNK = 4096
 """Rows decoded at a time."""
@@ -173,19 +173,24 @@ def encode(values: np.ndarray, gain: np.ndarray, goal: Goal) -> Coded:
     al. 2003 for transport in a principal basis.
     """
     exponent, rows = _normalized(values, gain)
-    axes = _principal(rows[:: -(-len(rows) // FITTED_ROWS) or 1].astype(np.float64))
-    exact = _first(lambda step: _error(rows, *_attempt(rows, *axes, step)) <= goal.tolerance)
-    cheap = _first(lambda step: _size(*_attempt(rows, *axes, step)) > goal.spare) - 1
-    dear = _first(lambda step: _size(*_attempt(rows, *axes, step)) > goal.most) - 1 if exact > cheap else cheap
-    coefficient, basis, step = _attempt(rows, *axes, STEPS[max(min(max(exact, cheap), dear, len(STEPS) - 1), 0)])
+    few = rows[:: -(-len(rows) // FITTED_ROWS) or 1]
+    axes = _principal(few.astype(np.float64))
+
+    def attempt(number: int, of: np.ndarray = few) -> tuple[np.ndarray, ...]:
+        return _attempt(of, *axes, STEPS[number], len(rows))
+
+    exact = _first(lambda number: _error(few, *attempt(number)) <= goal.tolerance)
+    cheap = _first(lambda number: _size(*attempt(number), len(rows)) > goal.spare) - 1
+    dear = _first(lambda number: _size(*attempt(number), len(rows)) > goal.most) - 1 if exact > cheap else cheap
+    coefficient, basis, step = attempt(max(min(max(exact, cheap), dear, len(STEPS) - 1), 0), rows)
     exponent[~coefficient.any(axis=1)] = 0
     coefficient, source, step = _bytes_of(coefficient, step)
     return Coded(exponent, coefficient, basis[source].reshape(-1, *values.shape[1:]), step, np.asarray(gain, np.int8))
 
 
-def _first(is_met: Callable[[float], bool]) -> int:
+def _first(is_met: Callable[[int], bool]) -> int:
     """Number of the coarsest step that meets a condition, which all finer ones then do; one past the last if none."""
-    return bisect.bisect_left(range(len(STEPS)), True, key=lambda number: bool(is_met(STEPS[number])))
+    return bisect.bisect_left(range(len(STEPS)), True, key=lambda number: bool(is_met(number)))
 
 
 def _normalized(values: np.ndarray, gain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -212,9 +217,9 @@ def _principal(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return square / max(count, 1) * 0.25**ROW_BITS, axes
 
 
-def _attempt(rows: np.ndarray, variance: np.ndarray, axes: np.ndarray, step: float) -> tuple[np.ndarray, ...]:
+def _attempt(rows: np.ndarray, variance: np.ndarray, axes: np.ndarray, step: float, count: int) -> tuple:
     """Coefficients, basis and steps for one step of the coefficients: a basis row's step is that over its spread."""
-    count, width = rows.shape
+    width = rows.shape[1]
     rank = np.count_nonzero(count * variance > KEPT * step * step * max(count, width))
     fine = np.maximum(step / np.sqrt(count * variance[:rank]), FINEST_BASIS)
     most = np.iinfo(np.int16).max
@@ -223,8 +228,8 @@ def _attempt(rows: np.ndarray, variance: np.ndarray, axes: np.ndarray, step: flo
     basis *= np.where(largest < 0, -1.0, 1.0)
     unit = (step * fine).astype(np.float32)
     dual = np.linalg.pinv((basis * fine[:, None]) @ (basis * fine[:, None]).T, hermitian=True)
-    coefficient = np.empty((count, rank), np.int16)
-    for start in range(0, count, CHUNK):
+    coefficient = np.empty((len(rows), rank), np.int16)
+    for start in range(0, len(rows), CHUNK):
         part = slice(start, start + CHUNK)
         exact = (rows[part].astype(np.float64) @ basis.T) * (fine * 0.5**ROW_BITS) @ dual * (fine / unit)
         coefficient[part] = np.sign(exact) * np.floor(np.minimum(np.abs(exact) + ROUNDING, most))
@@ -241,14 +246,20 @@ def _bytes_of(coefficient: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np
     return digits, source, np.concatenate([step[coarse] * np.float32(BYTE), step[fine]])
 
 
-def _size(coefficient: np.ndarray, basis: np.ndarray, step: np.ndarray) -> float:
+def _size(coefficient: np.ndarray, basis: np.ndarray, step: np.ndarray, count: int) -> float:
     """Estimated bytes on disk for each row: the entropy of the columns, with what zstd takes beyond it."""
+    bits = _entropy(basis) / max(count, 1) + _entropy(coefficient.T) / max(len(coefficient), 1)
+    return ENTROPY_CODED * bits / 8
+
+
+def _entropy(rows: np.ndarray) -> float:
+    """Bits that the numbers of all rows take when each row has a code of its own."""
     bits = 0.0
-    for numbers in (*coefficient.T, *basis):
+    for numbers in rows:
         share = np.bincount(numbers.astype(np.int64) - int(numbers.min(initial=0)))
         share = share[share > 0] / max(len(numbers), 1)
         bits -= len(numbers) * float((share * np.log2(share)).sum())
-    return ENTROPY_CODED * bits / 8 / max(len(coefficient), 1)
+    return bits
 
 
 def _error(rows: np.ndarray, coefficient: np.ndarray, basis: np.ndarray, step: np.ndarray) -> float:
