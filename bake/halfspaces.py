@@ -29,6 +29,16 @@ WIDER = 0.98
 """A wider plane is taken when it gains at least this part of the best one's gain."""
 
 
+THIN = 0.5
+"""Part of a wall's thickness within which its plane falls off."""
+
+UNSURE = 0.1
+"""Part of the weight behind a plane for which the wall may be thinner than that."""
+
+TOUCHING = 1e-3
+"""How far before a plane what is met still belongs to its wall [voxels]."""
+
+
 @dataclass(frozen=True)
 class Falloff:
     """Widths that planes may have, from wide to narrow.
@@ -76,6 +86,8 @@ class Trial:
         Row of each pair's data point, ascending.
     place : (m, 3) float64 ndarray
         Each pair's receiver [m].
+    reach : (m,) float32 ndarray
+        Part of the way from each receiver to its data point where something is in the way, 1 for nothing.
     value : (m,) float64 ndarray
         What hiding the pair gains, negative where it must not be hidden.
     falloff : Falloff
@@ -89,9 +101,9 @@ class Trial:
         Width of each plane, -1 for no plane.
     """
 
-    def __init__(self, position, size, owner, place, value, falloff: Falloff) -> None:
+    def __init__(self, position, size, owner, place, reach, value, falloff: Falloff) -> None:
         self._position, self._size, self._falloff = position, size, falloff
-        self._owner, self._place, self._value = owner, place, value
+        self._owner, self._place, self._reach, self._value = owner, place, reach, value
         self._least = WORTH * np.bincount(owner, np.abs(value), len(size))
         self._hides = np.zeros((SLOTS, len(owner)), bool)
         self.plane = np.zeros((SLOTS, len(size), 4))
@@ -138,14 +150,32 @@ class Trial:
     def widen(self) -> None:
         """Give each plane the widest falloff that costs next to nothing; drop those that are not worth it."""
         for slot in range(SLOTS):
-            alone = self._open(slot)
-            height = self._heights(slot)
+            alone, height = self._open(slot), self._heights(slot)
             codes = range(len(self._falloff.width))
             parts = [(1 - self._falloff.factor(height, code)) * alone for code in codes]
             gain = np.stack([np.bincount(self._owner, part, len(self._size)) for part in parts])
             best = gain.max(axis=0)
+            fits = (gain >= WIDER * best) & self._fits_walls(slot, height)
+            fits[-1] |= ~fits.any(axis=0)
             kept = (self.code[slot] >= 0) & (best > self._least)
-            self.code[slot] = np.where(kept, (gain >= WIDER * best).argmax(axis=0), -1)
+            self.code[slot] = np.where(kept, fits.argmax(axis=0), -1)
+
+    def _fits_walls(self, slot: int, height: np.ndarray) -> np.ndarray:
+        """(codes, n) whether each width ends within the wall that stands between a data point and what is hidden.
+
+        A ray from the receiver meets the wall's far side: its depth behind the plane is the thickness there. What is
+        met before the plane is no part of the wall.
+        """
+        rows = np.flatnonzero((height < -self._falloff.least) & (self._value > 0))
+        owner, reach = self._owner[rows], self._reach[rows]
+        own = heights(self.plane[slot], self._position)[owner]
+        depth = -(height[rows] + reach * (own - height[rows]))
+        wall = depth > -TOUCHING * self._size[owner]
+        owner, depth, weight = owner[wall], depth[wall], self._value[rows[wall]]
+        total = UNSURE * np.bincount(owner, weight, len(self._size))
+        ends = self._falloff.moved + self._falloff.width
+        thin = [np.bincount(owner, weight * (THIN * depth < end), len(self._size)) for end in ends]
+        return np.stack(thin) <= total
 
     def _open(self, slot: int = -1) -> np.ndarray:
         """(m,) values of pairs that no plane hides, or none but that in a slot."""

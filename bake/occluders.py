@@ -185,8 +185,9 @@ class _Task:
         """Choose planes for the data points of a tile."""
         pairs, count = ranges(self.first, points)
         rows, candidates = ranges(self.first_candidate, points)
-        owner, place = np.repeat(np.arange(len(points)), count), self.place[self.pairs.receiver[pairs]]
-        trial = Trial(self.data.position[points], self.data.size[points], owner, place, value[pairs], self.falloff)
+        owner, part = np.repeat(np.arange(len(points)), count), self.pairs.take(pairs)
+        own = self.data.position[points], self.data.size[points], owner
+        trial = Trial(*own, self.place[part.receiver], part.reach, value[pairs], self.falloff)
         trial.choose(blockers.Candidates(np.repeat(np.arange(len(points)), candidates), self.candidates.plane[rows]))
         trial.separate()
         trial.widen()

@@ -37,12 +37,14 @@ class Pairs:
     point : (m,) int64, row of the data points
     weight : (m,) float32, stencil weight times the cosine at the receiver
     blocker : (m, 2) int32, the first opaque triangle seen from the receiver, and from the data point; -1 for none
+    reach : (m,) float32, part of the way from the receiver to the first one; 1 for none
     """
 
     receiver: np.ndarray
     point: np.ndarray
     weight: np.ndarray
     blocker: np.ndarray
+    reach: np.ndarray
 
     @property
     def visible(self) -> np.ndarray:
@@ -62,7 +64,7 @@ class Pairs:
         Pairs
             In the order of `rows`.
         """
-        return Pairs(self.receiver[rows], self.point[rows], self.weight[rows], self.blocker[rows])
+        return Pairs(self.receiver[rows], self.point[rows], self.weight[rows], self.blocker[rows], self.reach[rows])
 
 
 def look(
@@ -116,9 +118,9 @@ def _levels(scene: Scene, data: interpolate.DataPoints, receivers: Receivers, ro
         low = np.flatnonzero(seen < ENOUGH)
         receiver, point, weight = _taps(data, receivers.take(low), finest)
         start = np.ascontiguousarray(lifted(scene, receivers)[:, low[receiver]])
-        blocker = _blockers(scene, start, data.position[point].T.astype(np.float32))
+        blocker, reach = _blockers(scene, start, data.position[point].T.astype(np.float32))
         seen[low] += np.bincount(receiver, weight * (blocker[:, 0] == MISS), len(low))
-        yield Pairs(rows[low[receiver]], point, weight, blocker)
+        yield Pairs(rows[low[receiver]], point, weight, blocker, reach)
 
 
 def _taps(data: interpolate.DataPoints, receivers: Receivers, finest: int):
@@ -131,25 +133,25 @@ def _taps(data: interpolate.DataPoints, receivers: Receivers, finest: int):
     return (np.concatenate(columns) for columns in zip(*parts, strict=True))
 
 
-def _blockers(scene: Scene, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """(m, 2) first opaque triangles from start to end and from end to start."""
+def _blockers(scene: Scene, start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(m, 2) first opaque triangles from start to end and from end to start, and how far the former ones are."""
     way = np.ascontiguousarray(end - start)
     blocker = np.full((way.shape[1], 2), MISS, np.int32)
-    blocker[:, 0] = _first(scene, start, way)
+    blocker[:, 0], reach = _first(scene, start, way)
     hidden = np.flatnonzero(blocker[:, 0] != MISS)
-    back = _first(scene, np.ascontiguousarray(end[:, hidden]), -way[:, hidden])
+    back, _ = _first(scene, np.ascontiguousarray(end[:, hidden]), -way[:, hidden])
     blocker[hidden, 1] = np.where(back == MISS, blocker[hidden, 0], back)
-    return blocker
+    return blocker, np.where(blocker[:, 0] == MISS, np.float32(1), reach)
 
 
-def _first(scene: Scene, origin: np.ndarray, way: np.ndarray) -> np.ndarray:
-    """(m,) first opaque triangle on each segment."""
-    far = np.full(way.shape[1], SHORTENED)
-    return scene.tracer.intersect_opaque(origin, way, far).triangle.astype(np.int32)
+def _first(scene: Scene, origin: np.ndarray, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(m,) first opaque triangle on each segment, and what part of it lies before."""
+    hits = scene.tracer.intersect_opaque(origin, way, np.full(way.shape[1], SHORTENED))
+    return hits.triangle.astype(np.int32), hits.distance
 
 
 def _join(parts: list[Pairs]) -> Pairs:
     """All pairs."""
-    empty = Pairs(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.float32), np.zeros((0, 2), np.int32))
-    names = ("receiver", "point", "weight", "blocker")
-    return Pairs(*(np.concatenate([getattr(part, name) for part in (empty, *parts)]) for name in names))
+    none = np.zeros(0, np.int64)
+    empty = Pairs(none, none, np.zeros(0, np.float32), np.zeros((0, 2), np.int32), np.zeros(0, np.float32))
+    return Pairs(*(np.concatenate([getattr(part, name) for part in (empty, *parts)]) for name in vars(empty)))
