@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from gi_volumes.bake import fit as module
-from gi_volumes.bake.fit import PRIOR, System, evaluate, fit, leverage, squared_bias, squared_error
+from gi_volumes.bake.fit import PRIOR, System, evaluate, fit, trust
+from gi_volumes.bake.fit_error import leverage, squared_bias, squared_error
 from gi_volumes.tree import harmonics
 
 TAPS = 16
@@ -258,6 +259,41 @@ def test_the_leverage_is_exact_where_a_receiver_has_one_data_point():
     normal = matrix.T @ matrix + np.diag(np.tile(PRIOR * PENALTY, 30))
     wanted = np.einsum("ni,ni->n", matrix, np.linalg.solve(normal, matrix.T).T)
     assert np.allclose(leverage(system) * wanted.mean() / leverage(system).mean(), wanted, atol=1e-4)
+
+
+def test_trust_grows_with_noise_and_only_there():
+    system, traced = random_system(60, 3000), random_values(60)
+    generator, truth = np.random.default_rng(8), evaluate(system, random_values(60, seed=2))
+    noisy = (system.row[:, :4].min(axis=1) > 30)[:, None, None]
+    halves = truth + np.where(noisy, 30.0, 0.01) * generator.normal(size=(2, *truth.shape))
+    found = trust(system, traced, halves.astype(np.float32))
+    assert found[:28].max() < 0.5
+    assert found[36:56].min() > 0.5
+    assert found[36:56].mean() > 4 * found[:28].mean()
+    scaled = trust(system, traced * np.float32(1e25), (halves * 1e25).astype(np.float32))
+    assert np.allclose(scaled, found, rtol=1e-3)
+
+
+def test_trust_where_nothing_is_known_is_finite():
+    system, traced = random_system(6, 50, counts=np.zeros(50)), random_values(6)
+    for halves in (np.zeros((2, 50, 1, 3), np.float32), np.ones((2, 50, 1, 3), np.float32)):
+        assert np.isfinite(trust(system, traced, halves)).all()
+    none = System(6, np.zeros((0, TAPS), np.int64), np.zeros((0, TAPS)), np.zeros((0, 9)), np.zeros(0))
+    assert (trust(none, traced, np.zeros((2, 0, 1, 3), np.float32)) > 0).all()
+    with pytest.raises(ValueError, match="halves"):
+        trust(system, traced, np.zeros((50, 1, 3), np.float32))
+
+
+def test_trust_keeps_fireflies_out():
+    system, truth = random_system(60, 3000), random_values(60)
+    generator, seen = np.random.default_rng(5), evaluate(system, truth)
+    halves = np.repeat(seen[None], 2, axis=0)
+    halves[0, generator.random(3000) < 0.01] *= 300
+    traced = truth + (0.1 * generator.normal(size=truth.shape)).astype(np.float32)
+    mean = halves.mean(axis=0)
+    plain, wary = fit(system, traced, mean), fit(system, traced, mean, trust(system, traced, halves))
+    plain_error, wary_error = (np.sqrt(((evaluate(system, found) - seen) ** 2).mean()) for found in (plain, wary))
+    assert wary_error < 0.25 * plain_error
 
 
 def noise_runs(system: System, traced: np.ndarray, truth: np.ndarray, runs: int, sigma: float = 1.0):
