@@ -15,13 +15,18 @@ GRAY = Material("gray", Channel((0.5,) * 3))
 LEAF = Material("leaf", Channel((0.5,) * 3), alpha=Channel((0.5,)), alpha_mode="blend")
 
 
+REACH = 25.0
+"""Half of the box that most tests look into; the room around it is twice as wide [m]."""
+
+
 def scene_of(*parts, material: Material = GRAY) -> Scene:
-    return prepare(build_scenes.snapshot([(triangles, material) for triangles in parts]), Model())
+    """Parts in a large room, whose walls are outside of the box that `everywhere` looks into."""
+    room = build_scenes.box((-2 * REACH,) * 3, (2 * REACH,) * 3, inward=True)
+    return prepare(build_scenes.snapshot([(room, GRAY), *((triangles, material) for triangles in parts)]), Model())
 
 
 def everywhere(scene: Scene, spacing: float, **others) -> Receivers:
-    low, high = scene.soup.bounds
-    return spread(scene, low - 1, high + 1, spacing, **others)
+    return spread(scene, (-REACH,) * 3, (REACH,) * 3, spacing, **others)
 
 
 def clutter(seed: int, count: int = 300) -> np.ndarray:
@@ -134,7 +139,8 @@ def test_both_sides_of_leaves_have_receivers():
 
 def test_glass_before_a_wall_squeezes_nothing():
     glass = Material("glass", Channel((1.0,) * 3), transmission=Channel((1.0,)))
-    parts = [(build_scenes.plane(1), GRAY), (build_scenes.plane(1, 0.002), glass)]
+    room = build_scenes.box((-2 * REACH,) * 3, (2 * REACH,) * 3, inward=True)
+    parts = [(room, GRAY), (build_scenes.plane(1), GRAY), (build_scenes.plane(1, 0.002), glass)]
     found = everywhere(prepare(build_scenes.snapshot(parts), Model()), 0.1)
     assert found.area.sum() == pytest.approx(12, rel=1e-5)  # all but the glass that faces the wall
 
