@@ -27,10 +27,11 @@ from .measured import split
 from .place import Place, check_target
 from .progress import Progress
 from .reference import sun_strength
-from .refine import Judge, Target, fitted, refine
+from .refine import Target, refine
 from .scene import Model, Scene, prepare, scene_suns
 from .settings import LEVELS, Settings, SettingsError, check_scene, check_triangles, choose_grid, has_free_sun, model
 from .snapshot import Snapshot
+from .survey import Judge, fitted
 
 FORMAT = "gi_volumes bake 2"
 """Part of every bake's hash: files of another definition are baked anew."""
@@ -209,7 +210,7 @@ def _bake_cells(work: _Work, cells: list[tuple[int, int]], progress: Progress) -
 def _bake_cell(work: _Work, cell: tuple[int, int], show: Callable[[float], bool]) -> Topology:
     """Grow the tree of one cell, measure and fit its light, write its files."""
     found = outline(work.scene.soup.corners, work.grid, cell)
-    refined = refine(work.scene, work.grid, found, work.judge, work.target, show)
+    refined = refine(work.scene, found, work.judge, work.target, show)
     light = fitted(refined, work.target.effort.threads) if work.settings.fit else refined.measured.light
     tree, measured, data = refined.tree, refined.measured, refined.data
     corner = np.array([*cell, 0]) * work.grid.cell_size

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..tree.cells import OFFSET_STEPS
 from ..tree.grid import Grid
 from ..tree.topology import Topology
 from . import datapoints
@@ -81,6 +82,46 @@ def measure(
         if known is not None:
             target[row >= 0] = getattr(known, name)[row[row >= 0]]
     return out
+
+
+def move(
+    scene: Scene, grid: Grid, measured: Measured, rows: np.ndarray, offset: np.ndarray, effort: Effort
+) -> Measured:
+    """Measure some data points elsewhere in their voxels.
+
+    Parameters
+    ----------
+    scene : Scene
+        What light travels through.
+    grid : Grid
+        The lattice.
+    measured : Measured
+        A cell.
+    rows : (m,) int64 ndarray
+        Which data points.
+    offset : (m, 3) int8 ndarray
+        Where to, in free space: data point minus voxel centre in steps of the voxel size / 254.
+    effort : Effort
+        As they were measured before.
+
+    Returns
+    -------
+    Measured
+        The cell with these data points moved, and valid.
+    """
+    level, coords = measured.level[rows], measured.coords[rows]
+    size = np.asarray(grid.voxel_size(level.astype(np.int64)), np.float64)[:, None]
+    position = grid.centers(level, coords) + offset.astype(np.float64) * size / OFFSET_STEPS
+    found = gather(scene, HarmonicsSensor(), _columns(position), datapoints.keys(level, coords), effort)
+    parts = [measured.offset.copy(), measured.valid.copy(), measured.light.copy()]
+    for part, new in zip(parts, (offset, True, stack(scene, found)), strict=True):
+        part[rows] = new
+    return Measured(measured.level, measured.coords, *parts)
+
+
+def _columns(position: np.ndarray) -> np.ndarray:
+    """(3, n) float32."""
+    return np.ascontiguousarray(position.T.astype(np.float32))
 
 
 def stack(scene: Scene, found: Gathered) -> np.ndarray:

@@ -15,7 +15,7 @@ import numpy as np
 from . import warp
 from .datapoints import BACKFACE_LIMIT
 from .gather import TILE_LANES, run_tiles
-from .rays import MISS
+from .rays import MISS, Hits
 from .reference import START
 from .scene import Scene
 from .sobol import Sampler, scramble
@@ -41,6 +41,12 @@ LARGE = 8
 TINY = 1e-3
 """What a piece adds to a tile besides its points, so that tiles of tiny triangles stay small."""
 
+WITNESSES = 4
+"""Feelers of a back side whose ends are judged in their turn."""
+
+FIELDS = ("position", "normal", "area", "key", "front")
+KINDS = (np.float64, np.float32, np.float32, np.uint32, bool)
+
 STEP = np.round(2.0**32 / 1.32471795724474602596 ** np.array([[1.0], [2.0]])).astype(np.uint32) | np.uint32(1)
 """Steps of the additive sequence R2 in both coordinates, times 2**32 (Roberts 2018, from the plastic number)."""
 
@@ -53,12 +59,14 @@ class Receivers:
     normal : (n, 3) float32, unit length, towards free space
     area : (n,) float32 [m2] that the point stands for
     key : (n,) uint32, random
+    front : (n,) bool, whether that side is the front of its triangle
     """
 
     position: np.ndarray
     normal: np.ndarray
     area: np.ndarray
     key: np.ndarray
+    front: np.ndarray
 
     def take(self, rows: np.ndarray) -> Receivers:
         """Some of the points.
@@ -73,7 +81,7 @@ class Receivers:
         Receivers
             Copies.
         """
-        return Receivers(self.position[rows], self.normal[rows], self.area[rows], self.key[rows])
+        return Receivers(*(getattr(self, name)[rows] for name in FIELDS))
 
 
 @dataclass(frozen=True)
@@ -256,9 +264,8 @@ def _points(pieces: _Pieces, spacing: float) -> Receivers:
     normal = (cross / np.sqrt((cross**2).sum(axis=1, keepdims=True)))[sides] * np.where(front, 1, -1)[:, None]
     area = spacing**2 * np.maximum(expected, 1) / np.maximum(count, 1)
     area = np.where(expected < 1, spacing**2, area)
-    return Receivers(
-        position, normal.astype(np.float32)[row], area.astype(np.float32)[row], scramble(key[row] ^ number, 7)
-    )
+    normal, area = normal.astype(np.float32)[row], area.astype(np.float32)[row]
+    return Receivers(position, normal, area, scramble(key[row] ^ number, 7), front[row])
 
 
 def _on_triangle(corners: np.ndarray, bits: np.ndarray) -> np.ndarray:
@@ -270,13 +277,38 @@ def _on_triangle(corners: np.ndarray, bits: np.ndarray) -> np.ndarray:
 
 
 def _is_free(scene: Scene, receivers: Receivers, crack: float) -> np.ndarray:
-    """(n,) whether a side sees free space: few backs of opaque faces, and not only what lies against it."""
-    point, sample = np.divmod(np.arange(len(receivers.key) * FEELERS), FEELERS)
-    sampler = Sampler(scramble(receivers.key, 0), 0, FEELERS)
-    normal = np.ascontiguousarray(receivers.normal.T)[:, point]
+    """(n,) whether a side sees free space: few backs of opaque faces, and not only what lies against it.
+
+    A back side is free only where most fronts around it are: nobody is beneath the ground, or inside a closed wall
+    that furniture sticks into.
+    """
+    direction, hits, met = _feel(scene, lifted(scene, receivers), receivers.normal.T, receivers.key)
+    free = _has_space(hits, direction, met, crack)
+    back = np.flatnonzero(free & ~receivers.front)
+    lane = (back[:, None] * FEELERS + np.arange(0, FEELERS, FEELERS // WITNESSES)).reshape(-1)
+    lane = lane[met[lane] & (warp.dot(hits.normal[:, lane], direction[:, lane]) < 0)]
+    normal = hits.normal[:, lane] / np.sqrt(warp.dot(hits.normal[:, lane], hits.normal[:, lane]))
+    position = lifted(scene, receivers)[:, lane // FEELERS] + direction[:, lane] * hits.distance[lane]
+    position += normal * (START * scene.tracer.offset(position, hits.distance[lane]))
+    other, there, blocked = _feel(scene, position, normal, scramble(receivers.key[lane // FEELERS], 8))
+    good = _has_space(there, other, blocked, crack)
+    votes = np.bincount(lane // FEELERS, np.where(good, 1, -1), len(free))
+    free[back] &= votes[back] > 0
+    return free
+
+
+def _feel(scene: Scene, position: np.ndarray, normal: np.ndarray, key: np.ndarray):
+    """(3, n * FEELERS) directions by the cosine, what they meet, and whether that is opaque."""
+    point, sample = np.divmod(np.arange(len(key) * FEELERS), FEELERS)
+    sampler = Sampler(scramble(key, 0), 0, FEELERS)
+    normal = np.ascontiguousarray(normal)[:, point]
     direction = warp.cosine(*(sampler.uniform(point, sample, dimension) for dimension in (0, 1)), normal)
-    hits = scene.tracer.intersect(np.ascontiguousarray(lifted(scene, receivers)[:, point]), direction)
-    met = (hits.triangle != MISS) & ~scene.surfaces.transparent[hits.triangle]
+    hits = scene.tracer.intersect(np.ascontiguousarray(position[:, point]), direction)
+    return direction, hits, (hits.triangle != MISS) & ~scene.surfaces.transparent[hits.triangle]
+
+
+def _has_space(hits: Hits, direction: np.ndarray, met: np.ndarray, crack: float) -> np.ndarray:
+    """(n,) whether few feelers meet backs, and most go farther than a crack is wide."""
     back = (met & (warp.dot(hits.normal, direction) > 0)).reshape(-1, FEELERS)
     close = (met & (hits.distance < crack)).reshape(-1, FEELERS)
     return (back.mean(axis=1) <= BACKFACE_LIMIT) & (close.mean(axis=1) <= 0.5)
@@ -284,6 +316,5 @@ def _is_free(scene: Scene, receivers: Receivers, crack: float) -> np.ndarray:
 
 def _join(parts: list[Receivers]) -> Receivers:
     """All of them."""
-    empty = Receivers(np.zeros((0, 3)), np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros(0, np.uint32))
-    columns = ([getattr(part, name) for part in (empty, *parts)] for name in ("position", "normal", "area", "key"))
-    return Receivers(*(np.concatenate(column) for column in columns))
+    empty = Receivers(*(np.zeros(shape, kind) for shape, kind in zip(((0, 3), (0, 3), 0, 0, 0), KINDS, strict=True)))
+    return Receivers(*(np.concatenate([getattr(part, name) for part in (empty, *parts)]) for name in FIELDS))

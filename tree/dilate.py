@@ -84,11 +84,11 @@ def own(outline: Outline, level: int, coords: np.ndarray) -> np.ndarray:
 def _others(outline: Outline, dilation: str) -> list[np.ndarray]:
     """Voxels of each level that other cells may have near the border, dilation included.
 
-    What they have depends on what they believe of this cell: all that geometry allows, not what it has.
+    What they have depends on what they believe of this cell: all that geometry allows, not what it has. Voxels asked
+    for by themselves lie next to solid ones.
     """
-    possible, finest = list(outline.border), len(outline.border) - 1
-    if dilation in ("full", BESIDE_FULL):
-        possible[finest] = _neighbours(possible[finest])
+    finest = len(outline.border) - 1
+    possible = [coords if level == 0 else _neighbours(coords) for level, coords in enumerate(outline.border)]
     for level in range(finest, 2, -1):
         asked = _asked(possible[level][:0], possible[level], 1 if level == finest else 2)
         possible[level - 1] = _once(np.concatenate([asked, possible[level] // BRANCH, possible[level - 1]]))

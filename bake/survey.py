@@ -1,0 +1,277 @@
+"""Surveys a cell: receivers all over its surfaces, the light that arrives there, and how wrong the data points are.
+
+Comes in: a tree with measured data points. Goes out: receivers path-traced twice, independently; data points fitted
+to them; and for each receiver an estimate of the squared error there that noise doesn't raise.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..tree import harmonics, interpolate
+from ..tree.blend import ENOUGH, blend, clamp
+from ..tree.stencil import taps
+from ..tree.topology import Topology
+from . import fit, fit_error, reference
+from .gather import Effort
+from .lamps import LUMINANCE
+from .measured import Measured, stack
+from .receivers import FIELDS, Receivers
+from .scene import Scene
+
+DARK = 0.1
+"""Errors count relative to the light at the receiver, and to this part of the cell's mean where it is darker."""
+
+INSIDE = 0.9
+"""Part of a receiver's linear weights that must lie in the cell itself for the receiver to have a say in the fit."""
+
+HALVES = (0x51ED, 0xA11E)
+"""Added to the seed for either half of the receivers' paths."""
+
+
+@dataclass(frozen=True, eq=False)
+class Judge:
+    """What the error is measured in: mixtures of the modelled functions.
+
+    views : (v, functions, 3) float64, each looked at by itself, their squared errors are added
+    mean : (functions, 3) float64, the mixture that errors are relative to
+    """
+
+    views: np.ndarray
+    mean: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Receivers and the light that arrives at them.
+
+    at : Receivers
+    light : (2, n, functions, 3) float32, two independent halves
+    """
+
+    at: Receivers
+    light: np.ndarray
+
+    def take(self, rows: np.ndarray) -> Seen:
+        """Some of them.
+
+        Parameters
+        ----------
+        rows : (m,) int64 or (n,) bool ndarray
+            Which.
+
+        Returns
+        -------
+        Seen
+            Copies.
+        """
+        return Seen(self.at.take(rows), self.light[:, rows])
+
+    def plus(self, other: Seen) -> Seen:
+        """These and others.
+
+        Parameters
+        ----------
+        other : Seen
+            More of them.
+
+        Returns
+        -------
+        Seen
+            These first.
+        """
+        at = Receivers(*(np.concatenate([getattr(part.at, name) for part in (self, other)]) for name in FIELDS))
+        return Seen(at, np.concatenate([self.light, other.light], axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """A cell's tree with its data.
+
+    tree : Topology
+    measured : Measured, its data points
+    data : DataPoints, the same for look-up, with occluding planes
+    seen : Seen, receivers all over it
+    """
+
+    tree: Topology
+    measured: Measured
+    data: interpolate.DataPoints
+    seen: Seen
+
+
+def trace(scene: Scene, at: Receivers, effort: Effort, progress: Callable[[float], bool] | None = None) -> Seen:
+    """Path-trace receivers twice.
+
+    Parameters
+    ----------
+    scene : Scene
+        What light travels through.
+    at : Receivers
+        Points on surfaces.
+    effort : Effort
+        Paths per receiver, shared by both halves.
+    progress : callable, optional
+        Called with the part that is done, 0 to 1; returns False to stop.
+
+    Returns
+    -------
+    Seen
+        Irradiance of every modelled function.
+
+    Raises
+    ------
+    CancelledError
+        `progress` returned False.
+    """
+    halves = []
+    for number, salt in enumerate(HALVES):
+        half = dataclasses.replace(effort, samples=max(1, effort.samples // 2), seed=effort.seed ^ salt)
+        show = progress and (lambda done, n=number: progress((n + done / len(at.key)) / len(HALVES)))
+        found = reference.at(scene, at.position + scene.origin, at.normal, half, show, at.key)
+        halves.append(stack(scene, found)[:, :, 0])
+    return Seen(at, np.stack(halves))
+
+
+def fitted(state: State, threads: int) -> np.ndarray:
+    """Fit the data points of a cell to what its receivers see.
+
+    Parameters
+    ----------
+    state : State
+        The cell.
+    threads : int
+        As in `Effort`.
+
+    Returns
+    -------
+    (points, functions, 9, 3) float32 ndarray
+        Irradiance harmonics. Receivers whose neighbourhood reaches into other cells have no say: their data
+        points are not known here.
+    """
+    use, system = _system(state)
+    if not len(use) or not state.measured.light.shape[1]:
+        return state.measured.light
+    return _fit(system, state.measured.light, state.seen.light[:, use], threads)
+
+
+def squared_errors(state: State, judge: Judge, threads: int) -> np.ndarray:
+    """Estimate the squared error of what receivers see, relative to the light there.
+
+    Parameters
+    ----------
+    state : State
+        A cell.
+    judge : Judge
+        What is looked at.
+    threads : int
+        As in `Effort`.
+
+    Returns
+    -------
+    (n,) float64 ndarray
+        Right on average, so that single ones may be negative.
+    """
+    use, system = _system(state)
+    stored = _views(np.moveaxis(state.measured.light, 1, 2), judge)
+    stored, halves = np.ascontiguousarray(np.moveaxis(stored, 2, 1)), _views(state.seen.light, judge)
+    if len(use):
+        prior = fit.trust(system, stored, halves[:, use])
+        stored = fit.fit(system, stored, halves[:, use].mean(axis=0), prior, _threads(threads))
+    one, other = _received(state, stored) - halves
+    squared = (one * other).sum(axis=(1, 2))
+    if len(use):
+        share = fit_error.leverage(system, prior)
+        squared[use] = fit_error.squared_error(system, stored, halves[:, use], share).sum(axis=(1, 2))
+    bright, typical = brightness(state.seen, judge)
+    return squared / np.maximum(bright**2 + (DARK * typical) ** 2, 1e-30)
+
+
+def brightness(seen: Seen, judge: Judge) -> tuple[np.ndarray, float]:
+    """Measure how much light there is.
+
+    Parameters
+    ----------
+    seen : Seen
+        Receivers.
+    judge : Judge
+        What is looked at.
+
+    Returns
+    -------
+    bright : (n,) float32 ndarray
+        Luminance of the mean view at each receiver.
+    typical : float
+        Its mean over the area.
+    """
+    bright = _looked_at(seen.light.mean(axis=0), judge.mean)
+    return bright, float((bright * seen.at.area).sum() / max(float(seen.at.area.sum()), 1e-30))
+
+
+def confidence(state: State) -> np.ndarray:
+    """Sum the weights of the data points that light each receiver.
+
+    Parameters
+    ----------
+    state : State
+        A cell.
+
+    Returns
+    -------
+    (n,) float32 ndarray
+        As `interpolate.weigh` gives them; below `blend.ENOUGH` coarser levels fill up.
+    """
+    return interpolate.weigh(state.data, state.seen.at.position, state.seen.at.normal)[1].sum(axis=1)
+
+
+def _system(state: State) -> tuple[np.ndarray, fit.System | None]:
+    """Receivers with a say, and how they see the data points."""
+    at, data = state.seen.at, state.data
+    row, weight = interpolate.weigh(data, at.position, at.normal)
+    total, reached = weight.sum(axis=1), np.zeros(len(weight))
+    for found in taps(data.grid, data.dual_cells, np.ascontiguousarray(at.position.T), data.grid.levels - 1):
+        reached[found.point] += found.weight.sum(axis=0)
+    use = np.flatnonzero((total > ENOUGH) & (reached > INSIDE))
+    if not len(use):
+        return use, None
+    basis = harmonics.basis(at.normal[use].astype(np.float64))
+    return use, fit.System(len(data.valid), row[use], weight[use] / total[use, None], basis, np.ones(len(use)))
+
+
+def _fit(system: fit.System, traced: np.ndarray, halves: np.ndarray, threads: int) -> np.ndarray:
+    """Fit to the mean of the halves; what they differ by says how far to trust the traced values."""
+    prior = fit.trust(system, traced, halves)
+    return fit.fit(system, traced, halves.mean(axis=0), prior, _threads(threads))
+
+
+def _threads(threads: int) -> int:
+    """0 stands for every core."""
+    return threads or os.cpu_count() or 1
+
+
+def _received(state: State, values: np.ndarray) -> np.ndarray:
+    """(n, functions, 3) what the run time shows at the receivers."""
+    at, count = state.seen.at, values.shape[1]
+    flat = np.ascontiguousarray(values.reshape(len(values), -1))
+    mean = blend(state.data, flat, clamp(state.data, at.position), at.normal).reshape(-1, count, 9, 3)
+    basis = harmonics.basis(at.normal.astype(np.float64)).astype(np.float32)
+    return np.maximum(np.einsum("nfkc,nk->nfc", mean, basis), 0.0)
+
+
+def _views(light: np.ndarray, judge: Judge) -> np.ndarray:
+    """(..., functions', 3) luminance of the views, three to a function, of (..., functions, 3) light."""
+    count = -(-len(judge.views) // 3)
+    out = np.zeros((*light.shape[:-2], 3 * count), np.float32)
+    for number, view in enumerate(judge.views):
+        out[..., number] = np.einsum("...fc,fc->...", light, (view * LUMINANCE).astype(np.float32))
+    return out.reshape(*light.shape[:-2], count, 3)
+
+
+def _looked_at(light: np.ndarray, view: np.ndarray) -> np.ndarray:
+    """(n,) luminance of a mixture of functions, of (n, functions, 3) light."""
+    return np.einsum("nfc,fc->n", light, (view * LUMINANCE).astype(np.float32))
