@@ -1,7 +1,7 @@
 """Half-spaces: the choice, for a tile of data points, of the planes that hide the most of what they must not light.
 
 Comes in: pairs with what hiding them gains, and candidate planes. Goes out: up to three planes for each data point and
-how wide each falls off. Candidates are taken greedily and again knowing the others; separators fill what is left.
+how wide each falls off. Candidates are taken greedily (filling slots again gains nothing); separators fill the rest.
 
     height     > -moved          -moved ... -moved - width       below
     factor     1                 1 + (height + moved) / width    0
@@ -18,9 +18,6 @@ from .separators import first_of_best, separate
 
 SLOTS = 3
 """Planes of a data point."""
-
-TURNS = 2 * SLOTS
-"""Each slot is filled, then filled again knowing the others."""
 
 WORTH = 2e-3
 """Part of a data point's weight that a plane must gain: less is not worth the bytes."""
@@ -120,9 +117,7 @@ class Trial:
         candidate, pair = _combine(candidates.point, self._owner, len(self._size))
         out = heights(candidates.plane[candidate], self._place[pair]) < -self._falloff.least
         candidate, pair = candidate[out], pair[out]
-        for turn in range(TURNS):
-            slot = turn % SLOTS
-            self._hides[slot] = False
+        for slot in range(SLOTS):
             gain = np.bincount(candidate, self._open()[pair], len(candidates.point))
             best, row = first_of_best(candidates.point, len(self._size), gain)
             taken = best > self._least

@@ -237,6 +237,6 @@ class _Task:
 
 def _falloff(finest: float, cell: float) -> Falloff:
     """Widths from a part of a voxel down to what float32 can tell apart."""
-    steps = np.arange(1 + int(np.log2(WIDEST * finest / (NARROWEST * cell)) // 2))
+    steps = np.arange(1 + max(0, int(np.log2(WIDEST * finest / (NARROWEST * cell)) // 2)))
     width = WIDEST * finest * 4.0**-steps
     return Falloff(width, np.minimum(width / 2, DEEPEST * finest))

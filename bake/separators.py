@@ -17,7 +17,7 @@ SPREADS = (0.01, 1e3)
 MARGIN = 0.01
 """How far from the data point itself a plane stays, in the units of the points."""
 
-SHIFTED = 0.25
+SHIFTED = 0.5
 """How far into the gap between the classes the plane lies, seen from what is kept."""
 
 
