@@ -3,7 +3,7 @@
 Comes in: receivers (surface points with the run time's own weights and their path-traced irradiance) and the values
 traced at the data points. Goes out: values c that minimise, summed over receivers s and data points k,
 
-    w_s (sum_k beta_sk Y(n_s) . c_k - E_s)^2  +  prior * |(c_k - traced_k) / cosine|^2
+    w_s (sum_k beta_sk Y(n_s) . c_k - E_s)^2  +  prior * |pi (c_k - traced_k) / cosine|^2
 
 by conjugate gradients. The second term is the inverse of the variance that noise of the radiance has around a data
 point: what no receiver sees stays as traced, and a change seen from one side does not reach the other.
@@ -19,6 +19,7 @@ from functools import cached_property
 import numpy as np
 
 from ..tree import harmonics
+from .normal_equations import Operator, Solver
 
 __all__ = ["PRIOR", "System", "evaluate", "fit", "trust"]
 
@@ -38,18 +39,11 @@ DOUBT = 2.0
 NOTHING = 1e-300
 """Stands for 0 where something is divided by it."""
 
-SUMMED = 16
-"""Taps of a data point in one matrix product; larger ones start threads of BLAS, which change the last bits."""
-
 COLUMN_TAPS = 1 << 25
 """Taps times columns that are solved at a time: 128 MiB in each of about three arrays."""
 
 COLUMNS = 26
 """Most columns in one block: such products stay far below the size at which BLAS starts threads."""
-
-ITERATIONS = 50
-TOLERANCE = 1e-2
-"""Relative residual, in the preconditioner's norm, at which a column is solved; 1e-5 changes errors by under 0.1 %."""
 
 
 @dataclass(frozen=True)
@@ -98,92 +92,7 @@ class System:
     @cached_property
     def operator(self) -> Operator:
         """The linear map from values to what receivers see, built once."""
-        return Operator(self)
-
-
-class Operator:
-    """The map from values (points, 9, columns) to irradiance (receivers, columns), and its transpose.
-
-    Taps lie sorted by data point, padded to whole products of `SUMMED`; receivers lie sorted by number of taps, so
-    that the j-th taps of all receivers that have so many are one gather.
-
-    Parameters
-    ----------
-    system : System
-        Checked.
-    """
-
-    def __init__(self, system: System) -> None:
-        used = (system.weight != 0) & (system.receiver > 0)[:, None]
-        receiver, slot = np.nonzero(used)
-        point = system.row[receiver, slot]
-        order = np.argsort(point, kind="stable")
-        receiver, slot, point = receiver[order], slot[order], point[order]
-        place, self._group_point = _places(point, system.points)
-        self.taps = len(self._group_point) * SUMMED
-        self.shape = (system.points, harmonics.COUNT)
-        self.order = np.argsort(-used.sum(axis=1), kind="stable")
-        self._seen_by = np.zeros(self.taps, np.int64)
-        self._seen_by[place] = np.argsort(self.order)[receiver]
-        self._slots = _slots(used, receiver, slot, place, self.order)
-        factors = np.zeros((self.taps, harmonics.COUNT), np.float32)
-        factors[place] = system.weight[receiver, slot, None] * system.basis[receiver]
-        self._factors = factors.reshape(-1, SUMMED, harmonics.COUNT)
-        self._rounds = _rounds(self._group_point, system.points)
-        self.weight = (system.receiver[self.order] / _mean_weight(system)).astype(np.float32)[:, None]
-
-    def apply(self, values: np.ndarray) -> np.ndarray:
-        """What receivers see.
-
-        Parameters
-        ----------
-        values : (points, 9, columns) float32 ndarray
-            Irradiance harmonics.
-
-        Returns
-        -------
-        (receivers, columns) float32 ndarray
-            In the operator's `order`.
-        """
-        parts = (self._factors @ values[self._group_point]).reshape(self.taps, values.shape[2])
-        out = np.zeros((len(self.order), values.shape[2]), np.float32)
-        for place in self._slots:
-            out[: len(place)] += parts[place]
-        return out
-
-    def transpose(self, seen: np.ndarray) -> np.ndarray:
-        """What data points are told.
-
-        Parameters
-        ----------
-        seen : (receivers, columns) float32 ndarray
-            In the operator's `order`.
-
-        Returns
-        -------
-        (points, 9, columns) float32 ndarray
-            Sums over receivers.
-        """
-        groups = seen[self._seen_by].reshape(-1, SUMMED, seen.shape[1])
-        return self._sum(self._factors.transpose(0, 2, 1) @ groups)
-
-    def blocks(self) -> np.ndarray:
-        """Diagonal blocks of transpose * weight * apply.
-
-        Returns
-        -------
-        (points, 9, 9) float32 ndarray
-            Symmetric, not negative.
-        """
-        weight = self.weight[self._seen_by].reshape(-1, SUMMED, 1)
-        return self._sum(self._factors.transpose(0, 2, 1) @ (self._factors * weight))
-
-    def _sum(self, groups: np.ndarray) -> np.ndarray:
-        """Sum the groups of each data point: the first of all, the second of those that have two, and so on."""
-        out = np.zeros((*self.shape, groups.shape[2]), np.float32)
-        for point, group in self._rounds:
-            out[point] += groups[group]
-        return out
+        return Operator(self.points, self.row, self.weight, self.basis, self.receiver / _mean(self.receiver))
 
 
 def fit(
@@ -302,102 +211,17 @@ def evaluate(system: System, values: np.ndarray) -> np.ndarray:
     return out
 
 
-class Solver:
-    """Conjugate gradients on the normal equations, preconditioned by each data point's own 9 x 9 block."""
-
-    def __init__(self, operator: Operator, prior: np.ndarray) -> None:
-        self._operator = operator
-        penalty = prior[:, None] * (harmonics.COSINE[0] / harmonics.COSINE) ** 2
-        blocks = operator.blocks().astype(np.float64) + penalty[:, :, None] * np.eye(harmonics.COUNT)
-        self.inverse = np.linalg.inv(blocks).astype(np.float32)
-        self._penalty = penalty[:, :, None].astype(np.float32)
-
-    def solve(self, traced: np.ndarray, seen: np.ndarray) -> np.ndarray:
-        """(points, 9, columns) fitted values, each column in its own unit."""
-        unit = _unit(traced, seen)
-        traced = traced / unit
-        residual = seen[self._operator.order] / unit - self._operator.apply(traced)
-        change = self._conjugate_gradients(self._operator.transpose(residual * self._operator.weight))
-        largest = np.finfo(np.float32).max / np.maximum(unit, 1.0)
-        return np.clip(traced + change, -largest, largest) * unit
-
-    def _conjugate_gradients(self, residual: np.ndarray) -> np.ndarray:
-        """Solve normal(x) = residual for every column."""
-        x = np.zeros_like(residual)
-        step = self.inverse @ residual
-        direction = step.copy()
-        energy = first = _dot(residual, step)
-        for _ in range(ITERATIONS):
-            image = self._normal(direction)
-            length = _ratio(energy, _dot(direction, image))
-            x += length * direction
-            residual = residual - length * image
-            step = self.inverse @ residual
-            before, energy = energy, _dot(residual, step)
-            if (energy <= first * TOLERANCE**2).all():
-                break
-            direction = step + _ratio(energy, before) * direction
-        return x
-
-    def _normal(self, values: np.ndarray) -> np.ndarray:
-        """The matrix of the normal equations."""
-        seen = self._operator.apply(values) * self._operator.weight
-        return self._operator.transpose(seen) + self._penalty * values
-
-
 def _around(system: System, values: np.ndarray | None = None) -> np.ndarray:
     """Sum over the receivers of each data point; of their weights without values."""
     share = system.weight * (system.receiver if values is None else system.receiver * values)[:, None]
     row = np.where(system.weight != 0, system.row, 0)
-    return np.bincount(row.ravel(), share.ravel() / _mean_weight(system), system.points)
+    return np.bincount(row.ravel(), share.ravel() / _mean(system.receiver), system.points)
 
 
-def _mean_weight(system: System) -> float:
-    """Mean of the receivers that count; 1 where there is none."""
-    positive = system.receiver[system.receiver > 0]
+def _mean(weights: np.ndarray) -> float:
+    """Mean of the weights above 0; 1 where there is none."""
+    positive = weights[weights > 0]
     return float(positive.mean(dtype=np.float64)) if len(positive) else 1.0
-
-
-def _places(point: np.ndarray, points: int) -> tuple[np.ndarray, np.ndarray]:
-    """Padded place of each tap, taps sorted by data point, and the data point of each group of `SUMMED` places."""
-    count = np.bincount(point, minlength=points)
-    groups = -(-count // SUMMED)
-    start = (np.cumsum(groups) - groups) * SUMMED - (np.cumsum(count) - count)
-    return np.arange(len(point)) + start[point], np.repeat(np.arange(points), groups)
-
-
-def _rounds(group_point: np.ndarray, points: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Data points that have a first group, and those groups; the same for a second group, and so on."""
-    count = np.bincount(group_point, minlength=points)
-    first, order = np.cumsum(count) - count, np.argsort(-count, kind="stable")
-    sizes = np.searchsorted(-count[order], -np.arange(count.max(initial=0)), side="left")
-    return [(order[:size], first[order[:size]] + number) for number, size in enumerate(sizes)]
-
-
-def _slots(used, receiver, slot, place, order: np.ndarray) -> list[np.ndarray]:
-    """Places of the first taps of all receivers, of the second taps of those that have two, and so on."""
-    table = np.full(used.shape, -1)
-    table[receiver, slot] = place
-    table = np.take_along_axis(table, np.argsort(table < 0, axis=1, kind="stable"), axis=1)[order]
-    return [column[: (column >= 0).sum()] for column in np.ascontiguousarray(table.T) if (column >= 0).any()]
-
-
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Inner product of each column."""
-    return np.einsum("kjf,kjf->f", a, b, dtype=np.float64, casting="same_kind")
-
-
-def _ratio(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Quotients, 0 where a column has nothing left to solve."""
-    return np.divide(a, b, out=np.zeros_like(a), where=b > 0).astype(np.float32)
-
-
-def _unit(traced: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Power of two at most the largest value of each column, so that squares stay in range."""
-    largest = np.abs(traced).max(axis=(0, 1), initial=0.0)
-    largest = np.maximum(largest, np.abs(seen).max(axis=0, initial=0.0))
-    exponent = np.frexp(np.where(largest > 0, largest, 1.0))[1] - 1
-    return np.ldexp(np.float32(1), np.maximum(exponent, -126)).astype(np.float32)
 
 
 def _check(system: System, traced: np.ndarray, seen: np.ndarray, prior):
@@ -412,7 +236,25 @@ def _check(system: System, traced: np.ndarray, seen: np.ndarray, prior):
 
 
 def check_prior(system: System, prior: float | np.ndarray) -> np.ndarray:
-    """The prior of each data point."""
+    """Refuse a prior that is none.
+
+    Parameters
+    ----------
+    system : System
+        The receivers.
+    prior : float or (points,) ndarray
+        As in `fit`.
+
+    Returns
+    -------
+    (points,) float64 ndarray
+        The prior of each data point.
+
+    Raises
+    ------
+    ValueError
+        It is not above 0, or has another shape.
+    """
     prior = np.asarray(prior, np.float64)
     if prior.shape not in ((), (system.points,)) or not (np.isfinite(prior) & (prior > 0)).all():
         raise ValueError(f"the prior must be above 0, one number or one for each of {system.points} data points")

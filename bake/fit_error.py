@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from ..tree import harmonics
-from .fit import PRIOR, Solver, System, check_prior, evaluate, fit
+from .fit import PRIOR, System, check_prior, evaluate, fit
+from .normal_equations import Solver
 from .sobol import scramble
 
 __all__ = ["leverage", "squared_bias", "squared_error"]

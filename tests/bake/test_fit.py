@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from gi_volumes.bake import fit as module
+from gi_volumes.bake import normal_equations
 from gi_volumes.bake.fit import PRIOR, System, evaluate, fit, trust
 from gi_volumes.bake.fit_error import leverage, squared_bias, squared_error
 from gi_volumes.tree import harmonics
@@ -61,8 +62,8 @@ def dense_fit(system: System, traced: np.ndarray, seen: np.ndarray, prior) -> np
 @pytest.fixture
 def exact(monkeypatch):
     """Solve to rounding."""
-    monkeypatch.setattr(module, "TOLERANCE", 1e-7)
-    monkeypatch.setattr(module, "ITERATIONS", 300)
+    monkeypatch.setattr(normal_equations, "TOLERANCE", 1e-7)
+    monkeypatch.setattr(normal_equations, "ITERATIONS", 300)
 
 
 @pytest.mark.parametrize(("points", "receivers", "prior"), [(1, 50, 0.3), (7, 5, 0.3), (12, 200, 0.05), (30, 700, 2.0)])
