@@ -126,6 +126,8 @@ def fit(
     Notes
     -----
     Error: `TOLERANCE`; `test_the_fit_is_the_dense_least_squares_solution`. The same bits for any number of threads.
+    With four receivers a data point and `trust` the error on surfaces fell by a quarter in the mean of ten transports
+    of five scenes, and in free air rose by 2 %, by 12 % in the worst.
     Source: Iwanicki and Sloan 2017, "Precomputed Lighting in Call of Duty: Infinite Warfare"; the prior is ours.
     """
     traced, seen, prior = _check(system, traced, seen, prior)
