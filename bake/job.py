@@ -209,7 +209,7 @@ def _bake_cells(work: _Work, cells: list[tuple[int, int]], progress: Progress) -
 
 def _bake_cell(work: _Work, cell: tuple[int, int], show: Callable[[float], bool]) -> Topology:
     """Grow the tree of one cell, measure and fit its light, write its files."""
-    found = outline(work.scene.soup.corners, work.grid, cell)
+    found = outline(work.scene.soup.corners, work.grid, cell, by_light=work.target.error > 0)
     refined = refine(work.scene, found, work.judge, work.target, show)
     light = fitted(refined, work.target.effort.threads) if work.settings.fit else refined.measured.light
     tree, measured, data = refined.tree, refined.measured, refined.data

@@ -279,8 +279,8 @@ def _on_triangle(corners: np.ndarray, bits: np.ndarray) -> np.ndarray:
 def _is_free(scene: Scene, receivers: Receivers, crack: float) -> np.ndarray:
     """(n,) whether a side sees free space: few backs of opaque faces, and not only what lies against it.
 
-    A back side is free only where most fronts around it are: nobody is beneath the ground, or inside a closed wall
-    that furniture sticks into.
+    A back side among fronts is free only where most of these are: nobody is inside a closed wall that furniture
+    sticks into.
     """
     direction, hits, met = _feel(scene, lifted(scene, receivers), receivers.normal.T, receivers.key)
     free = _has_space(hits, direction, met, crack)
@@ -293,7 +293,7 @@ def _is_free(scene: Scene, receivers: Receivers, crack: float) -> np.ndarray:
     other, there, blocked = _feel(scene, position, normal, scramble(receivers.key[lane // FEELERS], 8))
     good = _has_space(there, other, blocked, crack)
     votes = np.bincount(lane // FEELERS, np.where(good, 1, -1), len(free))
-    free[back] &= votes[back] > 0
+    free[back] &= votes[back] >= 0
     return free
 
 

@@ -30,8 +30,9 @@ from .measured import measure, move
 from .scene import Scene
 from .survey import Judge, Seen, State, confidence, squared_errors, trace
 
-SPACING = 0.5
-"""Distance between receivers, in voxels of the level that they judge: about four on a voxel's face."""
+SPACING = (0.25, 0.25, 0.4, 0.5)
+"""Distance between receivers, in voxels of the level that they judge, the first level first; the last for all others:
+four to sixteen on a voxel's face, fewer where there are more voxels."""
 
 FEWEST = 2
 """Receivers without which a voxel is not judged."""
@@ -122,7 +123,7 @@ class _Refinement:
         self.need = [np.zeros(len(mask)) for mask in outline.wanted]
         for level in range(len(self.need) if target.error == 0 else min(1, len(self.need))):
             first = GEOMETRY * FINER**level * (1.0 + outline.need[level])
-            self.need[level] = np.where(outline.wanted[level], first, 0.0)
+            self.need[level] = np.where(outline.need[level] > 0, first, 0.0)
         self.asked = [np.zeros((0, 3), np.int64)] * self.grid.levels
         self.state: State | None = None
 
@@ -137,8 +138,8 @@ class _Refinement:
                 self.occlude(self.state.seen)
             if level == self.grid.levels - 1:
                 break
-            if level and self.target.error:
-                self.need[level] = self.wanting(level)
+            if self.target.error:
+                self.need[level] = np.maximum(self.need[level], self.wanting(level))
             if not (self.need[level] > 0).any():
                 break
         self.fill_cracks()
@@ -158,7 +159,8 @@ class _Refinement:
         inside = _voxels_of(self.grid, tree, level)
         low = np.array(tree.grid_min) * self.grid.first_size
         high = low + np.array(tree.grid_shape) * self.grid.first_size
-        at = receivers.spread(self.scene, low, high, SPACING * size, inside, effort.threads)
+        spacing = SPACING[min(level, len(SPACING) - 1)] * size
+        at = receivers.spread(self.scene, low, high, spacing, inside, effort.threads)
         seen = trace(self.scene, at, dataclasses.replace(effort, samples=self.target.samples), self.show())
         if self.state.seen is not None:
             seen = self.state.seen.take(~inside(self.state.seen.at.position)).plus(seen)

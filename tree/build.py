@@ -226,7 +226,8 @@ def _largest(outline: Outline, order: _Order, dilation: str, max_points: int) ->
             few, found = middle, tried
         else:
             many = middle
-    return _to_topology(outline, found, _count(found) - int(order.solid[few]), order.refused(few))
+    plain = _voxels(outline, order.divided(few), "none", order.asked)
+    return _to_topology(outline, found, max(_count(found) - _count(plain), 0), order.refused(few))
 
 
 def _least(outline: Outline, order: _Order, dilation: str, room: int) -> tuple[str, list[np.ndarray]]:
@@ -245,8 +246,9 @@ def _voxels(
     solid = [outline.coords[0]]
     for level, mask in enumerate(divided):
         solid.append(outline.coords[level + 1][mask[outline.parent[level + 1]]])
-        if asked is not None:
-            solid[-1] = own(outline, level + 1, np.concatenate([solid[-1], asked[level + 1]]))
+    for level in range(len(solid) - 1, 0, -1) if asked is not None else ():
+        below = solid[level + 1] // BRANCH if level + 1 < len(solid) else solid[level][:0]
+        solid[level] = own(outline, level, np.concatenate([solid[level], asked[level], below]))
     return dilate(outline, solid, dilation)
 
 

@@ -25,6 +25,8 @@ __all__ = ["Outline", "outline"]
 
 CANDIDATES = 4
 """An outline lists at most this many times the cap of voxels, so that a choice is left and memory is bounded."""
+LEAST = 1e-6
+"""Need of a voxel that geometry asks to subdivide, however little it varies."""
 REACH = 4
 """Voxels of a level that lie farther from a voxel of the level above it, in their own size, never ask for it."""
 
@@ -46,10 +48,11 @@ class Outline:
     parent : tuple of (m,) int64
         Row of each one's parent in the level before; level 0 has none.
     wanted : tuple of (m,) bool
-        Candidates: voxels that geometry asks to subdivide; one entry fewer than levels. Their solid children are
-        in the next level, those of others are not.
+        Candidates: voxels that geometry, or light, may ask to subdivide; one entry fewer than levels. Their solid
+        children are in the next level, those of others are not.
     need : tuple of (m,) float64
-        How varied the geometry in and around each voxel is, 0 to 1.5; one entry fewer than levels.
+        How varied the geometry in and around each voxel is, above 0 to 1.5, or 0 where it is flat; one entry fewer
+        than levels.
     border : tuple of (b, 3) int64
         Solid voxels on both sides of the cell's side borders that it or its neighbours may have, however they choose,
         as far as they matter to each other; none on the first level.
@@ -98,7 +101,12 @@ class _Level:
 
 
 def outline(
-    triangles: np.ndarray, grid: Grid, cell: tuple[int, int], flat: float = FLAT, max_points: int = MAX_POINTS
+    triangles: np.ndarray,
+    grid: Grid,
+    cell: tuple[int, int],
+    flat: float = FLAT,
+    max_points: int = MAX_POINTS,
+    by_light: bool = False,
 ) -> Outline | None:
     """Find out what the tree of a world cell could be.
 
@@ -115,6 +123,9 @@ def outline(
         asks for all. All cells of a bake must use the same.
     max_points : int
         Cap on the number of data points of the cell; it bounds the dense grid and the number of candidates.
+    by_light : bool
+        List flat voxels among the candidates too, with a need of 0, so that light may subdivide them; those whose
+        children are of the finest level excepted.
 
     Returns
     -------
@@ -135,7 +146,7 @@ def outline(
     dense = dense_box(covered, max_points)
     first = _first(surfaces, pairs, grid, dense)
     lost = ~first.own & _in_columns(first.voxels.coords, cell, 0)
-    levels, wanted, need, left_out = _descend(surfaces, first, grid, cell, flat, CANDIDATES * max_points)
+    levels, wanted, need, left_out = _descend(surfaces, first, grid, cell, (flat, by_light), CANDIDATES * max_points)
     number = tuple(int(n) for n in cell)
     return _collect(grid, number, dense, levels, wanted, need, left_out + int(lost.sum()))
 
@@ -176,20 +187,23 @@ def _first(surfaces: Surfaces, pairs: tuple[np.ndarray, np.ndarray], grid: Grid,
 
 
 def _descend(
-    surfaces: Surfaces, first: _Level, grid: Grid, cell: tuple[int, int], flat: float, budget: int
+    surfaces: Surfaces, first: _Level, grid: Grid, cell: tuple[int, int], rule: tuple[float, bool], budget: int
 ) -> tuple[list[_Level], list[np.ndarray], list[np.ndarray], int]:
     """All levels, what geometry asks for on each, and how many of these voxels the budget left whole."""
     levels, wanted, need, left_out = [first], [], [], 0
     margins = _margins(grid.levels)
     for level in range(grid.levels - 1):
         here = levels[-1]
-        asked, varied = assess(surfaces, here.voxels, flat)
-        children, refused = _children(surfaces, here, asked, varied, budget, (cell, level + 1, margins[level + 1]))
+        varied, spread = assess(surfaces, here.voxels, rule[0])
+        listed = varied | (rule[1] and level < grid.levels - 2)
+        varied_need = np.where(varied, np.maximum(spread, LEAST), 0.0)
+        band = cell, level + 1, margins[level + 1]
+        children, refused = _children(surfaces, here, listed, varied_need, budget, band)
         budget -= int(children.own.sum())
-        left_out += int(refused.sum())
+        left_out += int((refused & varied).sum())
         levels.append(children)
-        wanted.append(asked & ~refused)
-        need.append(varied)
+        wanted.append(listed & ~refused)
+        need.append(varied_need)
     return levels, wanted, need, left_out
 
 
