@@ -39,8 +39,8 @@ FINEST_BASIS = 2.0**-15
 """Finest step of the basis, whose numbers are at most 1 and have 16 bits."""
 BYTE = 256
 """A coefficient of 16 bits is stored as two of 8 bits, with the same row of the basis: no second type is needed."""
-ENTROPY_CODED = 1.2
-"""Bytes that zstd's Huffman codes take, of columns together, relative to the entropy of each."""
+TABLE_BYTES, TABLE_SHARE = 70, 1 / 8
+"""What zstd takes beyond the entropy of a column: at most so many bytes, and this share of the numbers."""
 CHUNK = 4096
 """Rows decoded at a time."""
 
@@ -248,8 +248,9 @@ def _bytes_of(coefficient: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np
 
 def _size(coefficient: np.ndarray, basis: np.ndarray, step: np.ndarray, count: int) -> float:
     """Estimated bytes on disk for each row: the entropy of the columns, with what zstd takes beyond it."""
-    bits = _entropy(basis) / max(count, 1) + _entropy(coefficient.T) / max(len(coefficient), 1)
-    return ENTROPY_CODED * bits / 8
+    thinned = count / max(len(coefficient), 1)
+    tables = min(TABLE_BYTES, TABLE_SHARE * count) + min(TABLE_BYTES, TABLE_SHARE * basis.shape[1])
+    return (_entropy(basis) / 8 + _entropy(coefficient.T) / 8 * thinned + tables * len(basis)) / max(count, 1)
 
 
 def _entropy(rows: np.ndarray) -> float:
