@@ -177,6 +177,8 @@ def _add_bake(commands) -> None:
     command.add_argument("--error", type=_error, help=text)
     text = "most data points of a world cell"
     command.add_argument("--max-points", type=_points, default=MAX_POINTS, help=text)
+    text = "most bytes of a world cell, such as 500k or 2M: what buys least is left coarse"
+    command.add_argument("--max-bytes", type=_bytes, default=0, help=text)
     command.add_argument("--no-fit", action="store_true", help="keep data points as traced, not fitted to surfaces")
     text = "full gives surfaces data of the finest voxels alone: faster to look up, about twice the data"
     command.add_argument("--dilation", choices=("partial", "full"), default="partial", help=text)
@@ -224,7 +226,8 @@ def _run_bake(options, extract: Extract, progress: Progress) -> dict:
     samples, bounces = QUALITIES[options.quality]
     settings = _settings(options, options.samples or samples, bounces, options.finest)
     error = ERRORS[options.quality] if options.error is None else options.error
-    own = {"error": error, "max_points": options.max_points, "fit": not options.no_fit, "dilation": options.dilation}
+    own = {"error": error, "fit": not options.no_fit, "dilation": options.dilation}
+    own |= {"max_points": options.max_points, "max_bytes": options.max_bytes}
     settings = dataclasses.replace(settings, **own)
     check_target(options.output)
     snapshot = _read_scene(options.scene, extract, progress)
@@ -351,6 +354,15 @@ def _points(text: str) -> int:
     if value > MAX_POINTS:
         raise argparse.ArgumentTypeError(f"{text!r}: a world cell holds at most {MAX_POINTS} data points")
     return value
+
+
+def _bytes(text: str) -> int:
+    """A size in bytes, or thousands or millions of them."""
+    found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)([kKmM]?)", text)
+    value = float(found[1]) * {"": 1, "k": 1e3, "m": 1e6}[found[2].lower()] if found else 0
+    if not 1 <= value < 1e12:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a size in bytes, such as 500k or 2M")
+    return int(value)
 
 
 def _error(text: str) -> float:

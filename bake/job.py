@@ -31,13 +31,19 @@ from .refine import Target, refine
 from .scene import Model, Scene, prepare, scene_suns
 from .settings import LEVELS, Settings, SettingsError, check_scene, check_triangles, choose_grid, has_free_sun, model
 from .snapshot import Snapshot
-from .survey import Judge, fitted
+from .survey import Judge, State, fitted
 
 FORMAT = "gi_volumes bake 2"
 """Part of every bake's hash: files of another definition are baked anew."""
 
 LISTED = 12
 """Cells that a message names."""
+
+BUDGET_TRIES = 3
+"""Times that a cell is baked to find how many data points its bytes allow; the last one counts, whatever it takes."""
+
+BUDGET_MARGIN = 0.97
+"""Part of the bytes that the next try aims at."""
 
 STEPS = 1000
 """Units of progress in a cell."""
@@ -193,30 +199,56 @@ def _judge(snapshot: Snapshot, settings: Settings, scene: Scene) -> Judge:
     return Judge(np.array(views).reshape(-1, len(mean), 3), mean)
 
 
-def _bake_cells(work: _Work, cells: list[tuple[int, int]], progress: Progress) -> list[Topology]:
-    """Cell after cell; the ones already there are only read."""
+@dataclass(frozen=True)
+class _Counts:
+    """What a summary says of a cell's tree."""
+
+    size: int
+    dilated: int
+    left_out: int
+
+    @classmethod
+    def of(cls, tree: Topology) -> _Counts:
+        return cls(tree.size, tree.dilated, tree.left_out)
+
+
+def _bake_cells(work: _Work, cells: list[tuple[int, int]], progress: Progress) -> list[_Counts]:
+    """Cell after cell, of which nothing stays in memory; the ones already there are only read."""
     progress.stage("Baking", STEPS * len(cells))
-    trees = []
+    counts = []
     for number, cell in enumerate(cells):
         done = STEPS * number
         if folder.has_cell(work.place.target, cell, work.place.identity):
-            trees.append(folder.read_cell(work.place.target, cell).topology)
+            tree = folder.read_cell(work.place.target, cell).topology
         else:
-            trees.append(_bake_cell(work, cell, lambda share, d=done: progress.show(d + int(share * STEPS))))
+            tree = _bake_cell(work, cell, lambda share, d=done: progress.show(d + int(share * STEPS)))
+        counts.append(_Counts.of(tree))
         progress.show(done + STEPS)
-    return trees
+    return counts
 
 
 def _bake_cell(work: _Work, cell: tuple[int, int], show: Callable[[float], bool]) -> Topology:
-    """Grow the tree of one cell, measure and fit its light, write its files."""
+    """Grow the tree of one cell, measure and fit its light, write its files; again with fewer data points where it
+    takes more bytes than it may."""
     found = outline(work.scene.soup.corners, work.grid, cell, by_light=work.target.error > 0)
-    refined = refine(work.scene, found, work.judge, work.target, show)
-    light = fitted(refined, work.target.effort.threads) if work.settings.fit else refined.measured.light
-    tree, measured, data = refined.tree, refined.measured, refined.data
+    target, limit, known = work.target, work.settings.max_bytes, None
+    for last in (False,) * BUDGET_TRIES + (True,):
+        refined = refine(work.scene, found, work.judge, target, show, known)
+        size = _write(work, cell, refined, 0 if last else limit)
+        if last or not limit or size <= limit:
+            return refined.tree
+        known, points = refined.measured, int(refined.tree.size * BUDGET_MARGIN * limit / size)
+        target = dataclasses.replace(target, max_points=max(points, int(np.prod(found.dense.shape)) + 1))
+
+
+def _write(work: _Work, cell: tuple[int, int], refined: State, limit: int) -> int:
+    """Fit the data of a cell and write its files; their bytes."""
+    light = fitted(work.scene, refined, work.target.effort.threads) if work.settings.fit else refined.measured.light
+    measured, data = refined.measured, refined.data
     corner = np.array([*cell, 0]) * work.grid.cell_size
     planes = of_cell(data.planes, data.plane, data.position, corner)
-    work.place.write_cell(tree, split(work.scene, light), measured.valid, measured.offset, planes)
-    return tree
+    payloads = split(work.scene, light)
+    return work.place.write_cell(refined.tree, payloads, measured.valid, measured.offset, planes, limit)
 
 
 def _header(snapshot: Snapshot, settings: Settings, light: Model, scene: Scene, grid: Grid, identity: str) -> dict:

@@ -167,7 +167,8 @@ class Place:
         valid: np.ndarray,
         offset: np.ndarray,
         planes: CellPlanes | None = None,
-    ) -> None:
+        limit: int = 0,
+    ) -> int:
         """Put all files of a cell into the folder, or none; the tree, which makes a cell count, comes last.
 
         Parameters
@@ -182,6 +183,13 @@ class Place:
             Data point minus voxel centre, in voxel sizes / 254.
         planes : CellPlanes, optional
             Occluding planes of the data points; none when left out.
+        limit : int
+            Files that take more bytes than this together are not put there; 0 for no limit.
+
+        Returns
+        -------
+        int
+            Bytes of all files.
 
         Raises
         ------
@@ -190,9 +198,13 @@ class Place:
         """
         with self._stage() as staging:
             folder.write_cell(staging, tree, payloads, valid, offset, {"bake": self.identity}, planes)
+            size = sum(path.stat().st_size for path in staging.iterdir())
+            if limit and size > limit:
+                return size
             self.take()
             for path in sorted(staging.iterdir(), key=lambda path: path.suffix == ".tree"):
                 path.replace(self.target / path.name)
+        return size
 
     @contextlib.contextmanager
     def _stage(self) -> Iterator[Path]:

@@ -26,7 +26,7 @@ from ..tree.topology import Topology
 from . import occluders, receivers
 from .datapoints import FARTHEST_STEP
 from .gather import Effort
-from .measured import measure, move
+from .measured import Measured, measure, move
 from .scene import Scene
 from .survey import Judge, Seen, State, confidence, squared_errors, trace
 
@@ -81,6 +81,7 @@ def refine(
     judge: Judge,
     target: Target,
     progress: Callable[[float], bool] | None = None,
+    known: Measured | None = None,
 ) -> State:
     """Grow the tree of a cell until its surfaces see what they should.
 
@@ -96,6 +97,8 @@ def refine(
         When to stop.
     progress : callable, optional
         Called with the part that is done, 0 to 1; returns False to stop.
+    known : Measured, optional
+        Data points that have been measured already, with the same effort.
 
     Returns
     -------
@@ -111,15 +114,15 @@ def refine(
     -----
     Source: row 6 of the talk subdivides where there is geometry; by error as Unreal's and Activision's volumes do.
     """
-    return _Refinement(scene, outline, judge, target, progress).run()
+    return _Refinement(scene, outline, judge, target, progress, known).run()
 
 
 class _Refinement:
     """One cell on its way: what has been decided, by level, and what has been measured."""
 
-    def __init__(self, scene: Scene, outline: Outline, judge: Judge, target: Target, progress):
+    def __init__(self, scene: Scene, outline: Outline, judge: Judge, target: Target, progress, known):
         self.scene, self.outline, self.judge, self.target = scene, outline, judge, target
-        self.grid, self.progress, self.stage = outline.grid, progress, 0
+        self.grid, self.progress, self.stage, self.known = outline.grid, progress, 0, known
         self.need = [np.zeros(len(mask)) for mask in outline.wanted]
         for level in range(len(self.need) if target.error == 0 else min(1, len(self.need))):
             first = GEOMETRY * FINER**level * (1.0 + outline.need[level])
@@ -147,7 +150,7 @@ class _Refinement:
 
     def grow(self) -> None:
         """The tree of what is needed so far, measured."""
-        target, known = self.target, self.state and self.state.measured
+        target, known = self.target, self.state.measured if self.state else self.known
         tree = build.fit(self.outline, self.need, target.dilation, target.max_points, self.asked)
         measured = measure(self.scene, self.grid, tree, target.effort, known, self.show())
         data = interpolate.join(self.grid, [tree], measured.offset, measured.valid)

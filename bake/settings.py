@@ -26,8 +26,9 @@ QUALITIES = {"draft": (64, 6), "preview": (256, 8), "final": (1024, 12)}
 ERRORS = {"draft": 0.2, "preview": 0.1, "final": 0.05}
 """Relative error of surface irradiance above which a voxel is subdivided, by name of the quality."""
 
-RECEIVER_SHARE = 4
-"""A receiver has a fourth of a data point's paths: there are more of them, and they agree on what they fit."""
+RECEIVER_SHARE, RECEIVER_SAMPLES = 8, 32
+"""A receiver has an eighth of a data point's paths, but at least these: there are more of them, and more receivers
+beat more paths per receiver (`benchmarks/fit.py`)."""
 
 HEMISPHERE_KEYS = 16
 """Directions of a free sun."""
@@ -57,7 +58,7 @@ class Settings:
     dilation : "partial", or "full": surfaces have data of the finest level alone, for about twice the size
     seed : another seed gives independent noise
     error : relative error of surface irradiance above which a voxel is subdivided; 0: wherever geometry is not flat
-    max_points : most data points of a world cell
+    max_points, max_bytes : most data points and bytes of a world cell; 0 bytes for no limit
     fit : whether data points are fitted to what surfaces see of them
     """
 
@@ -70,12 +71,13 @@ class Settings:
     dilation: str = "partial"
     error: float = ERRORS["preview"]
     max_points: int = MAX_POINTS
+    max_bytes: int = 0
     fit: bool = True
 
     @property
     def receiver_samples(self) -> int:
         """Paths per receiver: an even number, as errors are measured by two independent halves."""
-        return max(2, self.samples // RECEIVER_SHARE // 2 * 2)
+        return max(RECEIVER_SAMPLES, self.samples // RECEIVER_SHARE // 2 * 2)
 
 
 def with_sky(snapshot: Snapshot, sky: str) -> tuple[Snapshot, str]:

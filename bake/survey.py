@@ -20,7 +20,7 @@ from ..tree.topology import Topology
 from . import fit, fit_error, reference
 from .gather import Effort
 from .lamps import LUMINANCE
-from .measured import Measured, stack
+from .measured import Measured, split, stack
 from .receivers import FIELDS, Receivers
 from .scene import Scene
 
@@ -138,11 +138,13 @@ def trace(scene: Scene, at: Receivers, effort: Effort, progress: Callable[[float
     return Seen(at, np.stack(halves))
 
 
-def fitted(state: State, threads: int) -> np.ndarray:
+def fitted(scene: Scene, state: State, threads: int) -> np.ndarray:
     """Fit the data points of a cell to what its receivers see.
 
     Parameters
     ----------
+    scene : Scene
+        Says what is modelled; every transport has its own noise.
     state : State
         The cell.
     threads : int
@@ -157,7 +159,10 @@ def fitted(state: State, threads: int) -> np.ndarray:
     use, system = _system(state)
     if not len(use) or not state.measured.light.shape[1]:
         return state.measured.light
-    return _fit(system, state.measured.light, state.seen.light[:, use], threads)
+    light, parts = split(scene, state.measured.light), []
+    for name, number in split(scene, np.arange(state.measured.light.shape[1])[None]).items():
+        parts.append(_fit(system, light[name], state.seen.light[:, use][:, :, number[0]], threads))
+    return np.concatenate(parts, axis=1)
 
 
 def squared_errors(state: State, judge: Judge, threads: int) -> np.ndarray:
