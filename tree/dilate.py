@@ -2,11 +2,11 @@
 
 Comes in: the voxels that a cell has, and those that its neighbours may have. Goes out: the voxels it must have.
 
-A missing voxel takes its value from the eight voxels of the coarser level whose centres surround its own. Where it is
-next to a voxel that exists, these eight must exist, or a neighbourhood would mix three levels. On the finest level
-"next to" means the 26 neighbours: a neighbourhood is 2 x 2 x 2 voxels there. One that is empty on the finest level
-reads up to 3 x 3 x 3 voxels of the next, so that on other levels it means two rings. Voxels that other cells may
-have count as existing and as missing. Full dilation first gives the finest solid voxels all their neighbours.
+The rule: the centre of each missing voxel that is one of the 26 neighbours of an existing one is surrounded by eight
+voxels of the next coarser level. No fewer do, since such a centre may be all that is missing around a point. It is
+enough at centroids of several missing voxels as well (`stencil`): the 4 x 4 x 4 voxels that share one coarser dual
+cell are all missing, all there, which takes their parents, or some are missing next to some that exist. Voxels that
+other cells may have count as existing and as missing. Full dilation first gives the finest solid voxels all neighbours.
 """
 
 from __future__ import annotations
@@ -51,12 +51,19 @@ def dilate(outline: Outline, solid: list[np.ndarray], dilation: str) -> list[np.
         return voxels
     others = _others(outline, dilation)
     if dilation == "full":
-        voxels[finest] = own(outline, finest, _neighbours(np.concatenate([solid[finest], outline.border[finest]])))
+        inner = np.concatenate([_solid_only(outline, solid[finest]), outline.border[finest]])
+        voxels[finest] = own(outline, finest, np.concatenate([solid[finest], _neighbours(inner)]))
     for level in range(finest, 1, -1):
-        asked = _asked(voxels[level], others[level], 1 if level == finest else 2)
+        asked = _asked(voxels[level], others[level])
         asked = np.concatenate([asked, voxels[level] // BRANCH, solid[level - 1]])
         voxels[level - 1] = own(outline, level - 1, asked)
     return voxels
+
+
+def _solid_only(outline: Outline, voxels: np.ndarray) -> np.ndarray:
+    """Those of the finest voxels that geometry has; the others stand next to them, and other cells expect no more."""
+    region = Region.around(np.concatenate([voxels, outline.coords[-1]]))
+    return voxels[np.isin(region.keys(voxels), region.keys(outline.coords[-1]))]
 
 
 def own(outline: Outline, level: int, coords: np.ndarray) -> np.ndarray:
@@ -90,7 +97,7 @@ def _others(outline: Outline, dilation: str) -> list[np.ndarray]:
     finest = len(outline.border) - 1
     possible = [coords if level == 0 else _neighbours(coords) for level, coords in enumerate(outline.border)]
     for level in range(finest, 2, -1):
-        asked = _asked(possible[level][:0], possible[level], 1 if level == finest else 2)
+        asked = _asked(possible[level][:0], possible[level])
         possible[level - 1] = _once(np.concatenate([asked, possible[level] // BRANCH, possible[level - 1]]))
     widths = [CELL_VOXELS * BRANCH**level for level in range(finest + 1)]
     homes = [coords[:, :2] // width for coords, width in zip(possible, widths, strict=True)]
@@ -104,25 +111,25 @@ def _once(coords: np.ndarray) -> np.ndarray:
 
 def _neighbours(coords: np.ndarray) -> np.ndarray:
     """All voxels with their 26 neighbours."""
-    bricks, near, _ = _near(coords[:0], coords, 1)
+    bricks, near, _ = _near(coords[:0], coords)
     row, x, y, z = np.nonzero(near)
     return bricks[row] * BRANCH + np.stack([x, y, z], axis=-1)
 
 
-def _asked(own: np.ndarray, other: np.ndarray, rings: int) -> np.ndarray:
-    """Coarser voxels from which missing ones take their value, where these are within some rings of existing ones.
+def _asked(own: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Coarser voxels around the centres of missing ones that have an existing neighbour.
 
     A child in the lower half of its parent, along an axis, lies between its parent's centre and the one before.
     """
-    bricks, near, exists = _near(own, other, rings)
+    bricks, near, exists = _near(own, other)
     asking = (near & ~exists).reshape(-1, 2, 2, 2, 2, 2, 2).any(axis=(2, 4, 6))
     row, x, y, z = np.nonzero(asking)
     base = bricks[row] + np.stack([x, y, z], axis=-1) - 1
     return (base[:, None] + CORNERS).reshape(-1, 3)
 
 
-def _near(own: np.ndarray, other: np.ndarray, rings: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Bricks of 4 x 4 x 4 voxels: coordinates, what is within some rings of any voxel, what exists for certain."""
+def _near(own: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Bricks of 4 x 4 x 4 voxels: coordinates, what is or neighbours any voxel, what exists for certain."""
     coords = np.concatenate([own, other])
     region = Region.around(coords // BRANCH, 1)
     keys = region.keys(coords // BRANCH)
@@ -133,16 +140,14 @@ def _near(own: np.ndarray, other: np.ndarray, rings: int) -> tuple[np.ndarray, n
     occupied[tuple(axis[: len(own)] for axis in place)] = True
     exists = occupied[:-1].copy()
     occupied[place] = True
-    near = _spread(_padded(occupied, bricks, steps, rings), rings)
-    return region.coords(bricks), near, exists
+    return region.coords(bricks), _spread(_padded(occupied, bricks, steps)), exists
 
 
-def _padded(occupied: np.ndarray, bricks: np.ndarray, steps: np.ndarray, rings: int) -> np.ndarray:
-    """Bricks with some rings of voxels from the bricks around them; the last of the occupied ones is empty."""
-    width = BRANCH + 2 * rings
-    padded = np.zeros((len(bricks), width, width, width), bool)
-    target = {-1: slice(0, rings), 0: slice(rings, rings + BRANCH), 1: slice(rings + BRANCH, width)}
-    source = {-1: slice(BRANCH - rings, BRANCH), 0: slice(0, BRANCH), 1: slice(0, rings)}
+def _padded(occupied: np.ndarray, bricks: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Bricks with a layer of voxels from the bricks around them; the last of the occupied ones is empty."""
+    padded = np.zeros((len(bricks), *[BRANCH + 2] * 3), bool)
+    target = {-1: slice(0, 1), 0: slice(1, -1), 1: slice(-1, None)}
+    source = {-1: slice(-1, None), 0: slice(0, BRANCH), 1: slice(0, 1)}
     for offset, step in zip(STEPS, steps, strict=True):
         place = np.searchsorted(bricks, bricks + step)
         found = np.flatnonzero(bricks[np.minimum(place, len(bricks) - 1)] == bricks + step)
@@ -151,9 +156,8 @@ def _padded(occupied: np.ndarray, bricks: np.ndarray, steps: np.ndarray, rings: 
     return padded
 
 
-def _spread(padded: np.ndarray, rings: int) -> np.ndarray:
-    """Whether any voxel within some rings is occupied, one axis after the other."""
+def _spread(padded: np.ndarray) -> np.ndarray:
+    """Whether a voxel or any of its neighbours is occupied, one axis after the other."""
     for axis in (1, 2, 3):
-        windows = [np.take(padded, range(shift, shift + BRANCH), axis=axis) for shift in range(2 * rings + 1)]
-        padded = np.logical_or.reduce(windows)
+        padded = np.logical_or.reduce([np.take(padded, range(step, step + BRANCH), axis=axis) for step in range(3)])
     return padded

@@ -1,7 +1,7 @@
-"""The definition of the interpolated value, by brute force: the judge of dilation.
+"""The definition of the interpolated value, by brute force: the judge of the stencil and of dilation.
 
-On every level, V(i) is the data of voxel i if it exists, else the value of the coarser level at its centre; the value
-of a level is the trilinear interpolation of V, and the value of the tree is that of the finest level.
+On a level, the eight voxels whose centres surround a point have trilinear weights. Those that exist count; what
+belongs to the others is the value of the coarser level at their centroid, or at the point itself where none exists.
 """
 
 import itertools
@@ -10,6 +10,8 @@ import numpy as np
 from gi_volumes.tree.lookup import Atlas
 
 CORNERS = np.array(list(itertools.product((0, 1), repeat=3)))
+ROUNDING = 1e-13
+"""Weight of missing voxels that is none."""
 
 
 class Definition:
@@ -25,29 +27,45 @@ class Definition:
     def at(self, points, level=None):
         """(n,) values and (n,) bits of the levels."""
         level = self.grid.levels - 1 if level is None else level
+        if level < 0:
+            return np.full(len(points), np.nan), np.zeros(len(points), np.int64)
+        center, weight, exists = self.corners(points, level)
+        value = (np.where(exists, self.field(center.reshape(-1, 3)).reshape(-1, 8), 0) * weight).sum(axis=1)
+        bits = np.where((exists & (weight > 0)).any(axis=1), 1 << level, 0)
+        lost = np.where(exists, 0, weight)
+        on = np.flatnonzero(lost.sum(axis=1) > ROUNDING)
+        share = lost[on].sum(axis=1)
+        moved = (center[on] * lost[on, :, None]).sum(axis=1) / share[:, None]
+        moved = np.where(exists[on].any(axis=1)[:, None], moved, points[on])
+        rest, more = self.at(moved, level - 1) if len(on) else (0.0, 0)
+        value[on] += share * rest
+        bits[on] |= more
+        return value, bits
+
+    def corners(self, points, level):
+        """(n, 8, 3) centres, (n, 8) weights, (n, 8) whether the voxels exist."""
         place = points / self.grid.voxel_size(level) - 0.5
         base = np.floor(place).astype(np.int64)
-        coords, inverse = np.unique((base[:, None] + CORNERS).reshape(-1, 3), axis=0, return_inverse=True)
-        value, levels = self._voxels(coords, level)
-        inverse = inverse.reshape(-1, 8)
+        coords = (base[:, None] + CORNERS).reshape(-1, 3)
+        exists = self.atlas.find(level, coords).reshape(-1, 8) >= 0
         weight = np.where(CORNERS, (place - base)[:, None], 1 - (place - base)[:, None]).prod(axis=2)
-        levels = np.where(weight > 0, levels[inverse], 0)
-        return (value[inverse] * weight).sum(axis=1), np.bitwise_or.reduce(levels, axis=1)
-
-    def _voxels(self, coords, level):
-        center = self.grid.centers(np.full(len(coords), level), coords)
-        exists = self.atlas.find(level, coords) >= 0
-        value, levels = np.where(exists, self.field(center), np.nan), np.where(exists, 1 << level, 0)
-        missing = np.flatnonzero(~exists)
-        if level and len(missing):
-            value[missing], levels[missing] = self.at(center[missing], level - 1)
-        return value, levels
+        return self.grid.centers(np.full(len(coords), level), coords).reshape(-1, 8, 3), weight, exists
 
 
 def one_or_two_levels(bits):
     """Whether the bits are one, or two in succession."""
     lowest = bits & -bits
     return (bits == lowest) | (bits == 3 * lowest)
+
+
+def surrounded(trees, grid, points):
+    """Whether first-level voxels surround points and all that their neighbourhoods on finer levels may ask for."""
+    atlas, reach, whole = Atlas(trees), grid.voxel_size(min(1, grid.levels - 1)), np.ones(len(points), bool)
+    for shift in CORNERS * 2 - 1:
+        base = np.floor((points + shift * reach) / grid.first_size - 0.5).astype(np.int64)
+        exists = atlas.find(0, (base[:, None] + CORNERS).reshape(-1, 3)) >= 0
+        whole &= exists.reshape(-1, 8).all(axis=1)
+    return whole
 
 
 def probes(trees, grid, seed=0, count=20_000):

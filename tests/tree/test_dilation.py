@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gi_volumes.tree import build, dilate, validate
+from gi_volumes.tree import build, validate
 from gi_volumes.tree.dilate import DILATIONS
 from gi_volumes.tree.grid import Grid
 from gi_volumes.tree.lookup import Atlas
@@ -41,11 +41,15 @@ SCENES = {
     "crumbs of four levels": (lambda: meshes.soup(40, 5, spread=8.0, size=0.02), 4, ALL),
     "crumbs of five levels": (lambda: meshes.soup(12, 4, spread=3.0, size=0.02), 5, ALL),
 }
+OF_ONE_CELL = {
+    "soup of one cell": (lambda: meshes.soup(40, 1, spread=14.0, size=1.5) + np.float32(64), 3, FLAT),
+    "crumbs of one cell": (lambda: meshes.soup(5, 5, spread=4.0, size=0.02) + np.float32(64), 4, ALL),
+}
 
 
 def outlines(name):
     """Outlines of all cells, each made alone, and the lattice."""
-    triangles, levels, flat = SCENES[name]
+    triangles, levels, flat = (SCENES | OF_ONE_CELL)[name]
     triangles, grid = triangles(), Grid(levels=levels)
     return [outline(triangles, grid, tuple(cell), flat) for cell in build.occupied_cells(triangles, grid)], grid
 
@@ -93,11 +97,45 @@ def test_without_dilation_neighbourhoods_have_more(name):
     assert not one_or_two_levels(levels_used(trees, grid)).all()
 
 
-def test_one_ring_is_not_enough_above_the_finest_level(monkeypatch):
-    """The reason for two rings: with one, the judge finds neighbourhoods of three levels in crumbs."""
-    asked = dilate._asked
-    monkeypatch.setattr(dilate, "_asked", lambda own, other, rings: asked(own, other, 1))
-    assert not one_or_two_levels(levels_used(*grown("crumbs of four levels"))).all()
+@pytest.mark.parametrize("name", OF_ONE_CELL)
+def test_dilation_adds_what_the_rule_asks_for_and_no_more(name):
+    """The least sets of voxels, by dictionary: parents, and what surrounds missing neighbours of existing voxels."""
+    (tree,), grid = grown(name)
+    level, coords = grown(name, "none")[0][0].voxels()
+    due = [set(map(tuple, coords[level == depth].tolist())) for depth in range(grid.levels)]
+    for depth in range(grid.levels - 1, 1, -1):
+        beside = {tuple(np.add(voxel, step).tolist()) for voxel in due[depth] for step in STEPS} - due[depth]
+        base = [[(number - 2) // 4 for number in voxel] for voxel in beside]
+        due[depth - 1] |= {tuple(np.add(voxel, corner).tolist()) for voxel in base for corner in CORNERS}
+        due[depth - 1] |= {tuple(number // 4 for number in voxel) for voxel in due[depth]}
+    level, coords = tree.voxels()
+    for depth in range(1, grid.levels):
+        assert set(map(tuple, coords[level == depth].tolist())) == due[depth]
+
+
+def test_no_voxel_that_dilation_adds_can_be_left_out(monkeypatch):
+    """Without any single one of them, but for the parents of others, some neighbourhood has data of three levels."""
+    name = "crumbs of one cell"
+    trees, grid = grown(name)
+    level, coords = trees[0].voxels()
+    exists = set(map(tuple, np.column_stack([level, coords]).tolist()))
+    solid = set(map(tuple, np.column_stack(grown(name, "none")[0][0].voxels()).tolist()))
+    parents = {(depth - 1, x // 4, y // 4, z // 4) for depth, x, y, z in exists}
+    added, rng = sorted(exists - solid - parents), np.random.default_rng(0)
+    judge = Definition(trees, grid, field)
+    find = judge.atlas.find
+    for depth, *voxel in (added[row] for row in rng.permutation(len(added))[:12]):
+        size = grid.voxel_size(depth)
+        steps = (np.indices([21] * 3).reshape(3, -1).T / 20 * 2.0 - 0.5) * size
+        points = np.array(voxel) * size + steps + rng.uniform(0, 1e-3, steps.shape) * size
+
+        def without(at, asked, depth=depth, voxel=voxel):
+            gone = (at == depth) & (asked == voxel).all(axis=1)
+            return np.where(gone, -1, find(at, asked))
+
+        fine = one_or_two_levels(Definition(trees, grid, field).at(points)[1])
+        monkeypatch.setattr(judge.atlas, "find", without)
+        assert not one_or_two_levels(judge.at(points)[1][fine]).all()
 
 
 @pytest.mark.parametrize("name", ["soup", "town", "four levels"])
