@@ -179,11 +179,12 @@ def small_disk(tmp_path):
 
 def test_a_full_disk_is_named_and_the_bake_before_stays_whole(level, small_disk):
     reason = "cannot write: No space left on device"
-    assert call("bake", level, "-o", small_disk / "new", "--samples", "4").reason.endswith(reason)
+    large = ("--samples", "4", "--error", "0.02", "--sky", "harmonics")
+    assert call("bake", level, "-o", small_disk / "new", *large).reason.endswith(reason)
     assert set(content(small_disk)) <= {"new/scene.giv", "new/world.json"}
     succeed("bake", level, "-o", small_disk / "old", "--samples", "4", "--finest", "8")
     before = content(small_disk / "old")
-    assert call("bake", level, "-o", small_disk / "old", "--samples", "4").reason.endswith(reason)
+    assert call("bake", level, "-o", small_disk / "old", *large).reason.endswith(reason)
     assert content(small_disk / "old") == before
     assert succeed("verify", small_disk / "old") == {"defects": []}
     asked = Points(small_disk, *ground_points(9))

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from command_line import QUICK, SUN, Points, call, cells_only, ground_points, stored, succeed, yard
 from gi_volumes.bake import snapshot_file
+from gi_volumes.bake.job import STEPS
 
 RESULT = {"triangles", "cells", "data_points", "bytes", "seconds", "rays", "modelled", "left_out", "warnings"}
 
@@ -68,7 +69,7 @@ def test_bake_tells_people_what_it_did_and_what_it_left_out(level, tmp_path):
     assert "data points in 1 cell(s) from 14 triangles" in said.out
     assert "modelled: local, sky" in said.out
     assert "left out: sun: " in said.out
-    assert said.err.splitlines() == ["Preparing", "Building trees", "Baking: 100 %"]
+    assert said.err.splitlines() == ["Preparing", "Baking: 100 %"]
 
 
 def test_progress_for_programs_is_one_object_per_line_and_the_last_one_is_the_result(level, tmp_path):
@@ -77,9 +78,10 @@ def test_progress_for_programs_is_one_object_per_line_and_the_last_one_is_the_re
     assert set(lines[-1]) == {"result"}
     assert set(lines[-1]["result"]) >= RESULT
     assert all(set(line) == {"stage", "done", "total", "seconds_left"} for line in lines[:-1])
-    assert [line["stage"] for line in lines[:2]] == ["Preparing", "Building trees"]
+    assert [line["stage"] for line in lines[:2]] == ["Preparing", "Baking"]
     bakes = [line for line in lines[:-1] if line["stage"] == "Baking"]
-    assert bakes[-1]["done"] == bakes[-1]["total"] == lines[-1]["result"]["data_points"]
+    assert bakes[-1]["done"] == bakes[-1]["total"] == STEPS * lines[-1]["result"]["cells"]
+    assert [line["done"] for line in bakes] == sorted({line["done"] for line in bakes})
     assert bakes[-1]["seconds_left"] == 0
     assert done.stderr == ""
 

@@ -107,8 +107,10 @@ def test_a_damaged_cell_is_baked_again_and_its_neighbours_are_not(row, row_baked
 def test_another_seed_gives_other_values_on_the_same_tree(row, row_baked, tmp_path, seed):
     succeed("bake", row, "-o", tmp_path, *QUICK, "--cells", "0,0", "--seed", seed)
     for name in ("local", "sun", "sky"):
-        table = container.read(tmp_path / f"cell_0_0.{name}").arrays["table"]
-        assert not np.array_equal(table, container.read(row.parent / "whole" / f"cell_0_0.{name}").arrays["table"])
+        here, there = (
+            container.read(folder / f"cell_0_0.{name}").arrays for folder in (tmp_path, row.parent / "whole")
+        )
+        assert not np.array_equal(here["coefficient"], there["coefficient"])
     assert np.array_equal(
         container.read(tmp_path / "cell_0_0.tree").arrays["mask"],
         container.read(row.parent / "whole" / "cell_0_0.tree").arrays["mask"],
@@ -215,14 +217,14 @@ def test_a_bake_that_is_killed_is_completed_by_the_next_run(row, row_slow, tmp_p
 def test_an_interruption_before_the_first_cell_leaves_another_bake_as_it_was(row, tmp_path, monkeypatch):
     succeed("bake", row, "-o", tmp_path, *QUICK)
     before = content(tmp_path)
-    monkeypatch.setattr("gi_volumes.bake.job.gather", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr("gi_volumes.bake.measured.gather", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         call("bake", row, "-o", tmp_path, *QUICK, "--seed", "9")
     assert content(tmp_path) == before
 
 
 def test_an_interruption_before_the_first_cell_leaves_an_empty_bake_in_a_new_folder(row, tmp_path, monkeypatch):
-    monkeypatch.setattr("gi_volumes.bake.job.gather", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr("gi_volumes.bake.measured.gather", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         call("bake", row, "-o", tmp_path / "out", *QUICK)
     assert set(content(tmp_path / "out")) == {"scene.giv", "world.json"}
@@ -350,7 +352,7 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_light_is_gathered
     def refused(path, *_, **__):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), os.fspath(path))
 
-    monkeypatch.setattr("gi_volumes.bake.job.gather", lambda *_: pytest.fail("worked in vain"))
+    monkeypatch.setattr("gi_volumes.bake.measured.gather", lambda *_: pytest.fail("worked in vain"))
     monkeypatch.setattr(os, "mkdir", refused)
     said = call("bake", row, "-o", target, *QUICK)
     monkeypatch.undo()
