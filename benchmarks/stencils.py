@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from gi_volumes.bake import datapoints
 from gi_volumes.tree import blend, harmonics
-from gi_volumes.tree.interpolate import DataPoints, layers
+from gi_volumes.tree.interpolate import DataPoints, last_resort, layers
 from gi_volumes.tree.world import World
 
 
@@ -167,25 +167,19 @@ def _taps(data: DataPoints, points: np.ndarray, normals: np.ndarray, level: int,
 
     points : (3, n) [m], normals : (3, n), share : (n,) what the taps' weights sum to, which : (n,) number of the point
     """
-    found = list(layers(data, points, normals, level) if level >= 0 else blend._plain(data, points))
+    found = list(layers(data, points, normals, level) if level >= 0 else last_resort(data, points))
     total = np.zeros(points.shape[1])
     for part in found:
         total[part.point] += part.weight.sum(axis=0)
-    scale = share / np.maximum(total, blend.ENOUGH)
+    scale = share / (np.maximum(total, blend.ENOUGH) if level >= 0 else np.where(total > 0, total, 1.0))
     for part in found:
         corner, column = np.nonzero(part.weight > 0)
         point = part.point[column]
         yield which[point], part.row[corner, column].astype(np.int64), part.weight[corner, column] * scale[point]
     low = np.flatnonzero(total < blend.ENOUGH)
-    if not len(low):
-        return
-    rest = scale[low] * (blend.ENOUGH - total[low])
-    if level >= 0:
+    if level >= 0 and len(low):
+        rest = scale[low] * (blend.ENOUGH - total[low])
         yield from _taps(data, points[:, low], normals[:, low], level - 1, rest, which[low])
-        return
-    rows = np.arange(len(data.valid), dtype=np.float64)[:, None]
-    nearest = blend._nearest(data, rows, points[:, low])[:, 0].astype(np.int64)
-    yield which[low], nearest, rest
 
 
 def _padded(count: int, point: np.ndarray, place: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

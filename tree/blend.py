@@ -4,16 +4,16 @@ Comes in: values at all data points, points, normals. Goes out: their weighted m
 
     F_l(p) = (sum of weight * value + (ENOUGH - s)+ F_(l-1)(p)) / max(s, ENOUGH),    s = sum of weights
 
-over the stencil that starts at level l. Below the first level counts the mean without cosine and planes, and last
-the nearest data point. The ramp keeps the value continuous where the last trusted data point fades out.
+over the stencil that starts at level l. F_-1, the last resort, has no cosine and no planes, and for voxels without a
+data point the nearest one stands in. The ramp keeps the value continuous where the last trusted data point fades out.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from .interpolate import DataPoints, layers
-from .stencil import Taps, taps
+from .interpolate import PAIRS, DataPoints, last_resort, layers
+from .stencil import Taps
 
 __all__ = ["ENOUGH", "blend", "clamp"]
 
@@ -21,8 +21,6 @@ ENOUGH = 0.02
 """Weights that sum to less are filled up: a twentieth of what one data point straight before a wall has."""
 FAR = 2.0**36
 """Points are clamped to this many first-level voxels, so that coordinates of all levels fit into int64."""
-PAIRS = 1 << 22
-"""Distances computed at a time."""
 
 
 def blend(data: DataPoints, values: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -81,25 +79,17 @@ def clamp(data: DataPoints, points: np.ndarray) -> np.ndarray:
 
 def _fill(data: DataPoints, values: np.ndarray, points: np.ndarray, normals: np.ndarray, level: int) -> np.ndarray:
     """F_level of the module's definition."""
-    found = layers(data, points, normals, level) if level >= 0 else _plain(data, points)
-    sums, total = _accumulate(found, values, points.shape[1])
+    if level < 0:
+        sums, total = _accumulate(last_resort(data, points), values, points.shape[1])
+        return sums / np.where(total > 0, total, 1)[:, None]
+    sums, total = _accumulate(layers(data, points, normals, level), values, points.shape[1])
     low = np.flatnonzero(total < ENOUGH)
     if len(low):
-        if level >= 0:
-            rest = _fill(data, values, points[:, low], normals[:, low], level - 1)
-        else:
-            rest = _nearest(data, values, points[:, low])
+        rest = _fill(data, values, points[:, low], normals[:, low], level - 1)
         sums[low] += (ENOUGH - total[low, None]) * rest
         total[low] = ENOUGH
     sums /= total[:, None]
     return sums
-
-
-def _plain(data: DataPoints, points: np.ndarray):
-    """The first level's taps by linear weight and validity only."""
-    for found in taps(data.grid, data.dual_cells, points, 0):
-        found.weight[:] *= data.valid[found.row]
-        yield found
 
 
 def _accumulate(found, values: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -124,23 +114,3 @@ def _weighted(part: Taps, values: np.ndarray) -> np.ndarray:
         read *= weight[:, None]
         sums += read
     return sums
-
-
-def _nearest(data: DataPoints, values: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Values of the valid voxels of the first level whose centres are nearest to the points' voxels."""
-    rows = np.flatnonzero((data.level == 0) & data.valid)
-    if not len(rows):
-        return np.zeros((points.shape[1], values.shape[1]), np.float32)
-    size = data.grid.first_size
-    voxels, inverse = np.unique(np.floor(points / size), axis=1, return_inverse=True)
-    center, step = (data.coords[rows] + 0.5) * size, max(1, PAIRS // len(rows))
-    found = np.empty(voxels.shape[1], np.int64)
-    for start in range(0, len(found), step):
-        part = (voxels[:, start : start + step].T + 0.5) * size
-        found[start : start + step] = _squared(part, center).argmin(axis=1)
-    return values[rows[found[inverse.reshape(-1)]]]
-
-
-def _squared(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Squared distances between all rows of two arrays."""
-    return sum((a[:, None, axis] - b[None, :, axis]) ** 2 for axis in range(3))

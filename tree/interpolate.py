@@ -23,7 +23,7 @@ from .lookup import Atlas
 from .stencil import Taps, taps
 from .topology import Topology
 
-__all__ = ["PLANES", "DataPoints", "join", "layers", "weigh"]
+__all__ = ["PLANES", "DataPoints", "join", "last_resort", "layers", "weigh"]
 
 PLANES = 3
 """Occluding planes of a data point."""
@@ -31,6 +31,8 @@ NEAR = 1e-3
 """Distance in voxel sizes within which the cosine fades to 1, as no direction exists at the data point itself."""
 ANY = np.float32(1e9)
 """Added height that makes every direction count alike."""
+PAIRS = 1 << 22
+"""Distances computed at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +102,32 @@ class DataPoints:
     def first_level(self) -> np.ndarray:
         """(f,) int64 rows of the valid voxels of the first level."""
         return np.flatnonzero((self.level == 0) & self.valid)
+
+    def stand_in(self, rows: np.ndarray) -> np.ndarray:
+        """Return data points that stand in for voxels of the first level: their own, or the nearest one.
+
+        Parameters
+        ----------
+        rows : (n,) int
+            Voxels of the first level, valid or not; there is a valid one.
+
+        Returns
+        -------
+        (n,) int64
+            Valid ones, nearest by the voxels' centres; of equals the first one.
+        """
+        unknown = np.unique(rows[self._stand_ins[rows] < 0])
+        step = max(1, PAIRS // len(self.first_level))
+        for start in range(0, len(unknown), step):
+            part = unknown[start : start + step]
+            nearest = _squared(self.coords[part], self.coords[self.first_level]).argmin(axis=1)
+            self._stand_ins[part] = self.first_level[nearest]
+        return self._stand_ins[rows]
+
+    @cached_property
+    def _stand_ins(self) -> np.ndarray:
+        """What `stand_in` knows so far; -1 for unknown."""
+        return np.where(self.valid, np.arange(len(self.valid)), -1)
 
 
 def join(
@@ -175,6 +203,31 @@ def layers(data: DataPoints, points: np.ndarray, normals: np.ndarray, finest: in
         yield found
 
 
+def last_resort(data: DataPoints, points: np.ndarray) -> Iterator[Taps]:
+    """Find what lights points that no data point can be trusted for: the first level by linear weights.
+
+    Parameters
+    ----------
+    data : DataPoints
+        The bake.
+    points : (3, n) float64
+        Relative to the origin [m].
+
+    Yields
+    ------
+    Taps
+        At most once. The nearest valid data points stand in for voxels that have none, so that this is continuous
+        too; no weight in a bake whose first level has none at all.
+    """
+    for found in taps(data.grid, data.dual_cells, points, 0):
+        used = found.weight > 0
+        if len(data.first_level):
+            found.row[used] = data.stand_in(found.row[used])
+        else:
+            found.weight[:] = 0.0
+        yield found
+
+
 def weigh(data: DataPoints, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the data points that light each point, as far as they are trusted.
 
@@ -239,3 +292,8 @@ def _occlude(data: DataPoints, found: Taps, points: np.ndarray) -> None:
         behind = sum(plane[axis] * at[axis, some] for axis in range(3)) - plane[3]
         seen[some] *= np.clip(1.0 + behind / plane[4], 0.0, 1.0)
     found.weight[corner, column] *= seen.astype(np.float32)
+
+
+def _squared(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Squared distances between all rows of two arrays."""
+    return sum((a[:, None, axis] - b[None, :, axis]) ** 2 for axis in range(3))

@@ -1,0 +1,267 @@
+"""The blended value: linear and convex, without a step along any path, the same however points are grouped."""
+
+import sys
+import tracemalloc
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from gi_volumes.tree import blend as module
+from gi_volumes.tree import interpolate
+from gi_volumes.tree.blend import blend, clamp
+from gi_volumes.tree.interpolate import weigh
+
+sys.path.insert(0, str(Path(__file__).parent))
+import bakes
+from definition import surrounded
+
+STEP = 1e-4
+"""Distance of neighbouring samples [m]."""
+CLOSE = 1e-9
+"""Distance that jumps are bisected down to [m]."""
+SAMPLES = 33
+"""Of a segment."""
+SMOOTH = 0.01
+"""Largest jump over CLOSE that is no step, in units of the field's range.
+
+Places are float32, so near a data point, within `NEAR`, the cosine has grains of 2^-24 / NEAR = 6e-5, which the ramp of
+`ENOUGH` makes up to 50 times coarser: 0.003, the largest that is seen. The steepest value changes by 0.07 over 0.1 um.
+"""
+
+
+def directions(count, seed=0):
+    d = np.random.default_rng(seed).normal(size=(count, 3))
+    return d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+def noise(data, seed=0):
+    """A value from 0 to 1 at every voxel, with no relation between neighbours."""
+    return np.random.default_rng(seed).random((len(data.valid), 1), np.float32)
+
+
+def features(data, count, seed=0):
+    """Where the definition changes: faces of dual cells of all levels, cell borders, edges of planes, data points."""
+    rng = np.random.default_rng(seed)
+    found = bakes.points(data, count, seed)
+    face, plane, close = np.array_split(rng.permutation(len(found)), 3)
+    level = rng.integers(0, data.grid.levels, len(face))
+    size, axis = np.asarray(data.grid.voxel_size(level)), rng.integers(0, 3, len(face))
+    found[face, axis] = (np.round(found[face, axis] / size - 0.5) + 0.5) * size
+    if len(data.plane):
+        user = rng.choice(np.flatnonzero(data.has_planes), len(plane))
+        found[plane] = data.position[user] + rng.uniform(-1, 1, (len(plane), 3)) * data.size[user, None]
+        used = data.plane[data.planes[user, 0]]
+        used = np.where(data.planes[user, :1] >= 0, used, [[0, 0, 1, 0, 1]])
+        height = (found[plane] * used[:, :3]).sum(axis=1) - used[:, 3]
+        edge = np.where(rng.random(len(plane)) < 0.5, 0, -used[:, 4])
+        found[plane] += used[:, :3] * (edge - height)[:, None]
+    row = rng.choice(np.flatnonzero(data.valid), len(close))
+    found[close] = data.position[row] + rng.normal(size=(len(close), 3)) * data.size[row, None] * 1e-3
+    return found
+
+
+def jumps(value, start, way):
+    """Largest changes between neighbouring samples of segments, and what is left of them within CLOSE.
+
+    value : takes (n, 3) points and segments' numbers; start, way : (n, 3) segments [m], of any length
+    """
+    count = len(start)
+    place = np.arange(SAMPLES) / (SAMPLES - 1)
+    at = (start[:, None] + way[:, None] * place[:, None]).reshape(-1, 3)
+    sampled = value(at, np.repeat(np.arange(count), SAMPLES)).reshape(count, SAMPLES)
+    change = np.abs(np.diff(sampled, axis=1))
+    worst = change.argmax(axis=1)
+    lower, upper, numbers = place[worst], place[worst + 1], np.arange(count)
+    low, high = sampled[numbers, worst], sampled[numbers, worst + 1]
+    length = np.linalg.norm(way, axis=1)
+    for _ in range(int(np.ceil(np.log2(length.max() / (SAMPLES - 1) / CLOSE)))):
+        middle = (lower + upper) / 2
+        between = value(start + way * middle[:, None], numbers)
+        first = np.abs(between - low) >= np.abs(high - between)
+        lower, low = np.where(first, lower, middle), np.where(first, low, between)
+        upper, high = np.where(first, middle, upper), np.where(first, between, high)
+    return change.max(axis=1), np.abs(high - low)
+
+
+def along_segments(data, values, start, way, normals):
+    """`jumps` of the blended value, each segment with its own normal."""
+    return jumps(lambda at, which: blend(data, values, at, normals[which])[:, 0], start, way)
+
+
+def inside(data, start, way):
+    """Segments whose ends lie in dense grids."""
+    voxels = np.floor(np.concatenate([start, start + way]) / data.grid.first_size).astype(np.int64)
+    return (data.atlas.find(0, voxels) >= 0).reshape(2, -1).all(axis=0)
+
+
+def short_segments(data, count, seed=0):
+    """Segments through features with samples STEP apart, in the dense grids, with normals; some along an axis."""
+    rng = np.random.default_rng(seed)
+    middle, way = features(data, count, seed), directions(count, seed + 1)
+    along = np.flatnonzero(rng.random(count) < 0.3)
+    way[along] = np.eye(3)[rng.integers(0, 3, len(along))]
+    middle, way = middle[:count], way[: len(middle)] * STEP * (SAMPLES - 1)
+    start, normals = middle - way * rng.random((len(middle), 1)), directions(len(middle), seed + 2)
+    normals[::10] = 0.0
+    kept = inside(data, start, way)
+    return start[kept], way[kept], normals[kept].astype(np.float32)
+
+
+@pytest.mark.parametrize("name", bakes.SCENES)
+@pytest.mark.parametrize("dilation", ["none", "partial", "full"])
+def test_the_value_has_no_step_inside_the_dense_grids(name, dilation):
+    """With normals, planes, moved and invalid data points, and every way to fill up: jumps shrink with the distance."""
+    data = bakes.rough(name, dilation)
+    values = noise(data)
+    start, way, normals = short_segments(data, 1500)
+    assert len(start) > 500
+    coarse, close = along_segments(data, values, start, way, normals)
+    assert coarse.max() > 2 * SMOOTH or data.grid.levels == 1
+    assert close.max() < SMOOTH
+
+
+@pytest.mark.parametrize("name", ["soup", "five levels"])
+def test_long_segments_have_no_step_either(name):
+    """Across many neighbourhoods: the largest change of each is followed down."""
+    data = bakes.rough(name)
+    start = bakes.points(data, 3000, seed=3)
+    way = directions(len(start), 4) * np.random.default_rng(5).uniform(0.05, 2.0, (len(start), 1))
+    kept = inside(data, start, way)
+    normals = directions(len(start), 6).astype(np.float32)
+    coarse, close = along_segments(data, noise(data), start[kept], way[kept], normals[kept])
+    assert coarse.max() > 0.3
+    assert close.max() < SMOOTH
+
+
+def test_the_bisection_finds_a_planted_step(monkeypatch):
+    """A cosine that starts at 0.05 instead of 0, a plane without a ramp, no filling up."""
+    data = bakes.rough("soup")
+    values, segments = noise(data), short_segments(data, 2500)
+    weight = interpolate._face
+
+    def stepped(data, found, normals):
+        weight(data, found, normals)
+        found.weight[:] = np.where(found.weight > 0, found.weight + np.float32(0.05), 0)
+
+    monkeypatch.setattr(interpolate, "_face", stepped)
+    assert along_segments(data, values, *segments)[1].max() > 10 * SMOOTH
+    monkeypatch.undo()
+    sharp = replace(data, plane=np.where(np.arange(5) == 4, 1e-12, data.plane))
+    assert along_segments(sharp, values, *segments)[1].max() > 10 * SMOOTH
+    monkeypatch.setattr(module, "ENOUGH", 1e-30)
+    assert along_segments(data, values, *segments)[1].max() > 10 * SMOOTH
+
+
+def test_the_last_resort_has_no_step_inside_the_dense_grids():
+    """Most of the first level invalid, normals into nowhere: only stand-ins count."""
+    data = bakes.rough("room")
+    data = replace(
+        data, valid=data.valid & (data.level == 0) & (np.random.default_rng(0).random(len(data.valid)) < 0.2)
+    )
+    start = bakes.points(data, 4000, seed=7)
+    way = directions(len(start), 8) * STEP * (SAMPLES - 1)
+    kept = inside(data, start, way)
+    close = along_segments(data, noise(data), start[kept], way[kept], directions(int(kept.sum())).astype(np.float32))[1]
+    assert close.max() < SMOOTH
+
+
+def test_outside_of_the_dense_grids_the_value_is_that_of_the_nearest_point_in_one():
+    """There it may step, between two grids that are equally near."""
+    data = bakes.rough("soup")
+    outside = np.random.default_rng(0).uniform(-150, 150, (2000, 3))
+    moved = clamp(data, outside)
+    nearest = np.clip(outside[:, None], data.boxes[:, 0], data.boxes[:, 1])
+    distance = np.linalg.norm(nearest - outside[:, None], axis=2).min(axis=1)
+    np.testing.assert_allclose(np.linalg.norm(moved - outside, axis=1), distance, atol=1e-9)
+    normals = directions(2000).astype(np.float32)
+    np.testing.assert_array_equal(clamp(data, moved), moved)
+    assert np.isfinite(blend(data, noise(data), moved, normals)).all()
+
+
+@pytest.mark.parametrize("name", bakes.SCENES)
+def test_linear_fields_are_reproduced_without_normals(name):
+    data = bakes.plain(name)
+    points = bakes.points(data, 20_000)
+    whole = surrounded(bakes.grown(name)[0], data.grid, points)
+    origin = points.mean(axis=0)
+    values = np.column_stack([data.position - origin, np.ones(len(data.valid))]).astype(np.float32)
+    found = blend(data, values, points, np.zeros_like(points))
+    np.testing.assert_allclose(found[whole, 3], 1, rtol=1e-6)
+    scale = np.abs(values).max()
+    np.testing.assert_allclose(found[whole, :3], (points - origin)[whole], atol=1e-6 * scale)
+
+
+@pytest.mark.parametrize("name", ["soup", "five levels"])
+def test_the_value_is_a_mean(name):
+    """Between the least and the largest value; a constant stays what it is, also outside and far away."""
+    data = bakes.rough(name)
+    points = np.concatenate([bakes.points(data, 20_000), directions(500) * 1e3, directions(500) * 1e12])
+    normals = directions(len(points)).astype(np.float32)
+    points = clamp(data, points)
+    found = blend(data, np.column_stack([noise(data), np.ones(len(data.valid), np.float32)]), points, normals)
+    np.testing.assert_allclose(found[:, 1], 1, rtol=1e-5)
+    assert found[:, 0].min() >= 0
+    assert found[:, 0].max() <= 1 + 1e-5
+
+
+def test_values_do_not_depend_on_the_order_or_number_of_points():
+    data = bakes.rough("soup")
+    values = np.random.default_rng(0).random((len(data.valid), 27), np.float32)
+    points, normals = bakes.points(data, 3000), directions(3000).astype(np.float32)
+    normals = normals[: len(points)]
+    whole = blend(data, values, points, normals)
+    order = np.random.default_rng(1).permutation(len(points))
+    np.testing.assert_array_equal(blend(data, values, points[order], normals[order]), whole[order])
+    for size in (1, 2, 7):
+        part = slice(100, 100 + size)
+        np.testing.assert_array_equal(blend(data, values, points[part], normals[part]), whole[part])
+
+
+def test_weights_say_how_far_the_finest_start_is_trusted():
+    """Where they sum to ENOUGH or more, the value is their mean."""
+    data = bakes.rough("soup")
+    points, values = bakes.points(data, 5000), noise(data)
+    normals = directions(len(points)).astype(np.float32)
+    row, weight = weigh(data, points, normals)
+    total = weight.sum(axis=1)
+    assert row.shape == weight.shape == (len(points), 16)
+    assert (data.valid[row] | (weight == 0)).all()
+    trusted = total > module.ENOUGH
+    expected = (values[row, 0] * weight).sum(axis=1)[trusted] / total[trusted]
+    found = blend(data, values, points, normals)[trusted, 0]
+    np.testing.assert_allclose(found, expected, rtol=1e-4)
+    assert 0.5 < trusted.mean() < 1
+
+
+def test_a_data_point_behind_its_planes_does_not_count():
+    """Brute force of the factors: cosine, planes, validity, of every tap."""
+    data = bakes.rough("slab")
+    points = bakes.points(data, 2000)
+    normals = directions(len(points))
+    row, weight = weigh(data, points, normals)
+    linear = weigh(bakes.plain("slab"), points, np.zeros_like(normals))
+    arm = (data.position[row] - points[:, None]) / data.size[row][..., None]
+    near = interpolate.NEAR
+    cosine = ((arm * normals[:, None]).sum(axis=2) + near) / np.sqrt((arm**2).sum(axis=2) + near**2)
+    plane = data.plane[data.planes[row]]
+    height = (plane[..., :3] * points[:, None, None]).sum(axis=3) - plane[..., 3]
+    seen = np.where(data.planes[row] >= 0, np.clip(1 + height / plane[..., 4], 0, 1), 1).prod(axis=2)
+    same = (row == linear[0]) | (weight == 0)
+    assert same.all()
+    expected = linear[1] * np.clip(cosine, 0, 1) * seen * data.valid[linear[0]]
+    np.testing.assert_allclose(weight, np.where(linear[0] == row, expected, weight), atol=2e-4)
+    assert (seen[weight > 0] < 1).any()
+
+
+def test_memory_of_a_chunk_is_bounded():
+    """`World.irradiance` hands over chunks; one chunk of one transport takes little."""
+    data = bakes.rough("soup")
+    values = np.zeros((len(data.valid), 27), np.float32)
+    points, normals = bakes.points(data, 1 << 14), directions(1 << 14).astype(np.float32)
+    blend(data, values, points[:10], normals[:10])
+    tracemalloc.start()
+    blend(data, values, points, normals[: len(points)])
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2000 * len(points)
