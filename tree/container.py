@@ -31,6 +31,8 @@ VERSION = 1
 PREFIX = struct.Struct("<8sIIQ")
 CHECKSUM = struct.Struct("<I")
 PREFIX_BYTES = PREFIX.size + CHECKSUM.size
+SHORT_HEADER = 512
+"""Headers below this are stored as text, which people can read [bytes]."""
 BLOCK_BYTES = 1 << 20
 """Raw bytes of every block but an array's last; a multiple of every item size."""
 COMPRESSION_LEVEL = 6
@@ -159,7 +161,7 @@ def encode(kind: str, arrays: dict[str, np.ndarray], meta: dict, units: dict[str
         entry, array_blocks = _encode_array(name, np.asarray(array), (units or {}).get(name, "1"))
         entries.append(entry)
         blocks += array_blocks
-    header = _to_json({"arrays": entries, "kind": kind, "meta": meta})
+    header = _packed(_to_json({"arrays": entries, "kind": kind, "meta": meta}))
     length = PREFIX_BYTES + len(header) + sum(map(len, blocks))
     prefix = PREFIX.pack(MAGIC, VERSION, len(header), length)
     checksum = CHECKSUM.pack(zlib.crc32(header, zlib.crc32(prefix)))
@@ -262,9 +264,29 @@ def _read_header(path: str | os.PathLike, file: BinaryIO) -> tuple[object, int]:
     if version != VERSION:
         raise FileError(path, 8, f"format version {version}; this program reads version {VERSION}")
     try:
-        return json.loads(text.decode("ascii"), parse_constant=_refuse_constant), PREFIX_BYTES + json_bytes
-    except (ValueError, RecursionError) as error:
+        header = _unpacked(text).decode("ascii")
+        return json.loads(header, parse_constant=_refuse_constant), PREFIX_BYTES + json_bytes
+    except (ValueError, RecursionError, zstandard.ZstdError) as error:
         raise FileError(path, PREFIX_BYTES, f"the header is not the JSON of this format: {error}") from None
+
+
+def _packed(text: bytes) -> bytes:
+    """The header as it is stored: as one zstd frame where that is shorter; a world of many cells is mostly headers."""
+    if not SHORT_HEADER <= len(text) <= BLOCK_BYTES:
+        return text
+    compressor = zstandard.ZstdCompressor(level=COMPRESSION_LEVEL, write_checksum=False, write_content_size=True)
+    return min(text, compressor.compress(text), key=len)
+
+
+def _unpacked(stored: bytes) -> bytes:
+    """The header's text; a frame that states no size, or a large one, is refused before it takes memory."""
+    if not stored.startswith(zstandard.FRAME_HEADER):
+        return stored
+    size = zstandard.get_frame_parameters(stored).content_size
+    if not 0 < size <= BLOCK_BYTES:
+        raise ValueError(f"a packed header of {size} bytes; at most {BLOCK_BYTES} are allowed")
+    decompressor = zstandard.ZstdDecompressor(max_window_size=BLOCK_BYTES)
+    return decompressor.decompress(stored, max_output_size=size, allow_extra_data=False)
 
 
 def _refuse_constant(name: str) -> float:

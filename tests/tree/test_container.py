@@ -275,3 +275,19 @@ def test_golden_bytes_of_version_1_are_written_and_read(tmp_path):
     got = container.read(tmp_path / "golden", "golden")
     np.testing.assert_array_equal(got.arrays["index"], index)
     assert got.meta == meta
+
+
+def test_long_headers_are_packed_and_read_back(tmp_path):
+    meta = {"names": [f"thing {number}" for number in range(200)]}
+    size = container.write(tmp_path / "long", "k", {}, meta)
+    assert size < len(json.dumps(meta)) // 2
+    assert container.read(tmp_path / "long").meta == meta
+
+
+@pytest.mark.parametrize("size", [None, 1 << 21])
+def test_packed_headers_of_unknown_or_great_size_are_refused(tmp_path, size):
+    text = json.dumps({"arrays": [], "kind": "k", "meta": {"a": "a" * (size or 10)}}).encode()
+    compressor = zstandard.ZstdCompressor(write_content_size=size is not None)
+    path = forge(tmp_path / "forged", compressor.compress(text) if size else compressor.compressobj().compress(text))
+    with pytest.raises(container.FileError, match="header"):
+        container.read(path)

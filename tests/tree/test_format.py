@@ -35,6 +35,8 @@ def read_container(path):
     assert (version, length) == (1, len(data))
     text = data[28 : 28 + header_bytes]
     assert checksum == zlib.crc32(data[:24] + text)
+    if text[:4] == bytes.fromhex("28B52FFD"):
+        text = zstandard.ZstdDecompressor().decompress(text)
     header, position, arrays = json.loads(text), 28 + header_bytes, {}
     for entry in header["arrays"]:
         raw = b""
