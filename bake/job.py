@@ -31,7 +31,7 @@ from .refine import Target, refine
 from .scene import Model, Scene, prepare, scene_suns
 from .settings import LEVELS, Settings, SettingsError, check_scene, check_triangles, choose_grid, has_free_sun, model
 from .snapshot import Snapshot
-from .survey import Judge, State, fitted
+from .survey import Judge, State, fitted, shade
 
 FORMAT = "gi_volumes bake 2"
 """Part of every bake's hash: files of another definition are baked anew."""
@@ -128,7 +128,7 @@ def bake(
         place.take()
     finally:
         listed = place.close()
-    outcome = _describe(snapshot, light, scene, trees)
+    outcome = _describe(snapshot, settings, light, scene, trees)
     outcome.voxels = {"first": grid.first_size, "finest": float(grid.voxel_size(grid.levels - 1))}
     if not settings.finest and grid.first_size != FIRST_SIZE:
         outcome.warnings.append(
@@ -196,7 +196,7 @@ def _judge(snapshot: Snapshot, settings: Settings, scene: Scene) -> Judge:
         for part, end in zip(parts, ends, strict=True)
         if len(part)
     ]
-    return Judge(np.array(views).reshape(-1, len(mean), 3), mean)
+    return Judge(np.array(views).reshape(len(views), len(mean), 3), mean)
 
 
 @dataclass(frozen=True)
@@ -246,7 +246,8 @@ def _write(work: _Work, cell: tuple[int, int], refined: State, limit: int) -> in
     light = fitted(work.scene, refined, work.target.effort.threads) if work.settings.fit else refined.measured.light
     measured, data = refined.measured, refined.data
     corner = np.array([*cell, 0]) * work.grid.cell_size
-    planes = of_cell(data.planes, data.plane, data.position, corner)
+    dim = shade(refined, light, work.judge) if light.shape[1] else 1.0
+    planes = of_cell(data.planes, data.plane, data.position, corner, dim)
     payloads = split(work.scene, light)
     return work.place.write_cell(refined.tree, payloads, measured.valid, measured.offset, planes, limit)
 
@@ -288,7 +289,7 @@ def _sun_header(snapshot: Snapshot, settings: Settings, light: Model) -> dict:
     }
 
 
-def _describe(snapshot: Snapshot, light: Model, scene: Scene, trees: list[Topology]) -> Outcome:
+def _describe(snapshot: Snapshot, settings: Settings, light: Model, scene: Scene, trees: list[Topology]) -> Outcome:
     """Counts, what was modelled, and what was left out and why."""
     outcome = Outcome(len(scene.soup.corners), len(trees), sum(tree.size for tree in trees))
     outcome.dilated = sum(tree.dilated for tree in trees)
@@ -305,7 +306,8 @@ def _describe(snapshot: Snapshot, light: Model, scene: Scene, trees: list[Topolo
             outcome.left_out.append({"what": name, "why": why})
     skipped = sum(tree.left_out for tree in trees)
     if skipped:
-        why = "a world cell holds at most 65,535 data points; the neediest voxels were refined"
+        limit = f"{settings.max_points:,} data points" + f" and {settings.max_bytes:,} bytes" * bool(settings.max_bytes)
+        why = f"a world cell may hold {limit}; the neediest voxels were refined"
         outcome.left_out.append({"what": f"{skipped} voxels", "why": why})
     outcome.left_out += [{"what": note.what, "why": note.why} for note in snapshot.notes]
     return outcome

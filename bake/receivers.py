@@ -20,10 +20,14 @@ from .reference import START
 from .scene import Scene
 from .sobol import Sampler, scramble
 
+SPACING = (0.25, 0.25, 0.4, 0.5)
+"""Distance between receivers, in voxels of the level that they judge, the first level first; the last for all others:
+four to sixteen on a voxel's face, fewer where there are more voxels."""
+
 FEELERS = 16
 """Rays that judge a side: a share of a quarter is known to within 0.11 (one standard deviation)."""
 
-CRACK = 1 / 8
+CRACK = 1 / 32
 """A side is squeezed when most of its rays end within this distance [spacings]: nobody sees what light is there."""
 
 PIECE = 128
@@ -155,7 +159,25 @@ def spread(
         return len(rows)
 
     run_tiles(work, _tiles(pieces, spacing), threads, progress)
-    return _join([found[first] for first in sorted(found)])
+    return join([found[first] for first in sorted(found)])
+
+
+def spacing(level: int, size: float) -> float:
+    """Choose the distance between the receivers that judge a level.
+
+    Parameters
+    ----------
+    level : int
+        The level.
+    size : float
+        Size of its voxels [m].
+
+    Returns
+    -------
+    float
+        About the side of the area that a receiver stands for [m].
+    """
+    return SPACING[min(level, len(SPACING) - 1)] * size
 
 
 def lifted(scene: Scene, receivers: Receivers) -> np.ndarray:
@@ -176,6 +198,33 @@ def lifted(scene: Scene, receivers: Receivers) -> np.ndarray:
     position = np.ascontiguousarray(receivers.position.T.astype(np.float32))
     normal = np.ascontiguousarray(receivers.normal.T)
     return position + normal * (START * scene.tracer.offset(position, np.zeros(position.shape[1], np.float32)))
+
+
+def none() -> Receivers:
+    """Make no receivers.
+
+    Returns
+    -------
+    Receivers
+        Empty.
+    """
+    return Receivers(*(np.zeros(shape, kind) for shape, kind in zip(((0, 3), (0, 3), 0, 0, 0), KINDS, strict=True)))
+
+
+def join(parts: list[Receivers]) -> Receivers:
+    """Put receivers together.
+
+    Parameters
+    ----------
+    parts : list of Receivers
+        Some, or none.
+
+    Returns
+    -------
+    Receivers
+        All of them.
+    """
+    return Receivers(*(np.concatenate([getattr(part, name) for part in (none(), *parts)]) for name in FIELDS))
 
 
 def _triangles(corners: np.ndarray, low: np.ndarray, high: np.ndarray, spacing: float) -> _Pieces:
@@ -312,9 +361,3 @@ def _has_space(hits: Hits, direction: np.ndarray, met: np.ndarray, crack: float)
     back = (met & (warp.dot(hits.normal, direction) > 0)).reshape(-1, FEELERS)
     close = (met & (hits.distance < crack)).reshape(-1, FEELERS)
     return (back.mean(axis=1) <= BACKFACE_LIMIT) & (close.mean(axis=1) <= 0.5)
-
-
-def _join(parts: list[Receivers]) -> Receivers:
-    """All of them."""
-    empty = Receivers(*(np.zeros(shape, kind) for shape, kind in zip(((0, 3), (0, 3), 0, 0, 0), KINDS, strict=True)))
-    return Receivers(*(np.concatenate([getattr(part, name) for part in (empty, *parts)]) for name in FIELDS))

@@ -23,16 +23,12 @@ from ..tree.lookup import Atlas
 from ..tree.outline import Outline
 from ..tree.region import Region, finder
 from ..tree.topology import Topology
-from . import occluders, receivers
+from . import judges, occluders, receivers
 from .datapoints import FARTHEST_STEP
 from .gather import Effort
 from .measured import Measured, measure, move
 from .scene import Scene
-from .survey import Judge, Seen, State, confidence, squared_errors, trace
-
-SPACING = (0.25, 0.25, 0.4, 0.5)
-"""Distance between receivers, in voxels of the level that they judge, the first level first; the last for all others:
-four to sixteen on a voxel's face, fewer where there are more voxels."""
+from .survey import Judge, State, confidence, squared_errors, trace
 
 FEWEST = 2
 """Receivers without which a voxel is not judged."""
@@ -40,8 +36,11 @@ FEWEST = 2
 WEAK = 0.1
 """Confidence below which a receiver is hardly lit; one data point straight before a wall gives up to a half."""
 
-NOISE = 0.2
-"""Relative error of a single receiver below which it may be noise."""
+CLEAR = 0.2
+"""Relative error of a single receiver that is worth a data point of its own."""
+
+SURE = 2.0
+"""Standard deviations of noise that an error must exceed to count."""
 
 FRONT = 0.05
 """Height above the surface at which a voxel's centre is in front of it [voxels]."""
@@ -138,7 +137,7 @@ class _Refinement:
             self.asked[level] = self.unlit(level)
             if len(self.asked[level]):
                 self.grow()
-                self.occlude(self.state.seen)
+                self.hide()
             if level == self.grid.levels - 1:
                 break
             if self.target.error:
@@ -162,21 +161,24 @@ class _Refinement:
         inside = _voxels_of(self.grid, tree, level)
         low = np.array(tree.grid_min) * self.grid.first_size
         high = low + np.array(tree.grid_shape) * self.grid.first_size
-        spacing = SPACING[min(level, len(SPACING) - 1)] * size
+        spacing = receivers.spacing(level, size)
         at = receivers.spread(self.scene, low, high, spacing, inside, effort.threads)
         seen = trace(self.scene, at, dataclasses.replace(effort, samples=self.target.samples), self.show())
         if self.state.seen is not None:
             seen = self.state.seen.take(~inside(self.state.seen.at.position)).plus(seen)
-        self.occlude(seen)
+        self.state = dataclasses.replace(self.state, seen=seen)
+        self.hide()
 
-    def occlude(self, seen: Seen) -> None:
-        """Planes for all data points, as receivers see them."""
-        hidden = occluders.fit(self.scene, self.state.data, seen.at, self.target.effort.threads)
+    def hide(self) -> None:
+        """Planes for all data points, as all surfaces see them that they may light, those of other cells too."""
+        threads = self.target.effort.threads
+        at = judges.around(self.scene, self.grid, self.state.tree, threads)
+        hidden = occluders.fit(self.scene, self.state.data, at, threads)
         data = dataclasses.replace(self.state.data, planes=hidden.planes, plane=hidden.plane)
-        self.state = dataclasses.replace(self.state, data=data, seen=seen)
+        self.state = dataclasses.replace(self.state, data=data)
 
-    def errors(self) -> np.ndarray:
-        """(n,) relative squared errors at the receivers."""
+    def errors(self) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) relative squared errors at the receivers, and (n,) what part of that may be noise."""
         return squared_errors(self.state, self.judge, self.target.effort.threads)
 
     def wanting(self, level: int) -> np.ndarray:
@@ -184,34 +186,40 @@ class _Refinement:
         coords, at = self.outline.coords[level], self.state.seen.at
         voxel = np.floor(at.position / float(self.grid.voxel_size(level))).astype(np.int64)
         near = np.flatnonzero(Region.around(coords).contains(voxel))
-        row, squared = finder(coords)(voxel[near]), self.errors()[near]
-        squared, area, row = (values[row >= 0] for values in (squared, at.area[near], row))
-        total, whole = (np.bincount(row, values, len(coords)) for values in (squared * area, area))
-        poor = (total > self.target.error**2 * whole) & (np.bincount(row, minlength=len(coords)) >= FEWEST)
-        return np.where(poor, total / np.maximum(self.outline.cost(level), 1), 0.0)
+        row, inside = finder(coords)(voxel[near]), near[finder(coords)(voxel[near]) >= 0]
+        row, area, count = row[row >= 0], at.area[inside], len(coords)
+        squared, noise = (np.bincount(row, values[inside] * area, count) for values in self.errors())
+        number = np.maximum(np.bincount(row, minlength=count), 1)
+        allowed = self.target.error**2 * np.bincount(row, area, count) + SURE * noise * np.sqrt(2 / number)
+        poor = (squared > allowed) & (number >= FEWEST)
+        return np.where(poor, squared / np.maximum(self.outline.cost(level), 1), 0.0)
 
     def unlit(self, level: int) -> np.ndarray:
         """(m, 3) missing voxels in front of receivers that hardly any data point lights, and that are wrong for it:
         a thin surface has two sides, and the data point of its voxel is on one of them."""
         at, tree, size = self.state.seen.at, self.state.tree, float(self.grid.voxel_size(level))
         chosen = _voxels_of(self.grid, tree, level)(at.position) & (confidence(self.state) < WEAK)
-        chosen &= self.errors() > max(self.target.error, NOISE) ** 2
+        chosen &= self.wrong()
         position, normal = at.position[chosen], at.normal[chosen]
         corner = np.floor(position / size - 0.5).astype(np.int64)[:, None] + CORNERS
         height = np.einsum("nci,ni->nc", (corner + 0.5) * size - position[:, None], normal)
         corner = np.unique(corner[height > FRONT * size], axis=0)
         return corner[Atlas([tree]).find(level, corner) < 0]
 
+    def wrong(self) -> np.ndarray:
+        """(n,) receivers whose error is too large to be noise."""
+        squared, noise = self.errors()
+        return squared > max(self.target.error, CLEAR) ** 2 + SURE**2 * noise
+
     def fill_cracks(self) -> None:
         """Move data points to where receivers have none, in voxels that are of less use elsewhere."""
         at, measured = self.state.seen.at, self.state.measured
-        wrong = self.errors()
-        unlit = np.flatnonzero((confidence(self.state) < ENOUGH) & (wrong > max(self.target.error, NOISE) ** 2))
+        unlit = np.flatnonzero((confidence(self.state) < ENOUGH) & self.wrong())
         row = _leaves(self.grid, self.state.tree, at.position[unlit])
         offset, free = self.in_front(unlit, row)
         unlit, row, offset = unlit[free], row[free], offset[free]
         use, gain = self.usefulness(), np.bincount(row, at.area[unlit], len(measured.level))
-        order = np.lexsort((-wrong[unlit], row))
+        order = np.lexsort((-at.area[unlit], row))
         row, first = np.unique(row[order], return_index=True)
         offset, better = offset[order][first], gain[row] > use[row]
         if better.any():
@@ -219,7 +227,7 @@ class _Refinement:
             measured = move(self.scene, self.grid, measured, row[better], offset[better], effort)
             data = interpolate.join(self.grid, [self.state.tree], measured.offset, measured.valid)
             self.state = State(self.state.tree, measured, data, self.state.seen)
-            self.occlude(self.state.seen)
+            self.hide()
 
     def in_front(self, chosen: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(n, 3) int8 offsets half-way to what stands before receivers, within their voxels, and (n,) whether the way

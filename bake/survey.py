@@ -20,7 +20,7 @@ from ..tree.topology import Topology
 from . import fit, fit_error, reference
 from .gather import Effort
 from .lamps import LUMINANCE
-from .measured import Measured, split, stack
+from .measured import Measured, functions, split, stack
 from .receivers import FIELDS, Receivers
 from .scene import Scene
 
@@ -129,6 +129,8 @@ def trace(scene: Scene, at: Receivers, effort: Effort, progress: Callable[[float
     CancelledError
         `progress` returned False.
     """
+    if not functions(scene):
+        return Seen(at, np.zeros((len(HALVES), len(at.key), 0, 3), np.float32))
     halves = []
     for number, salt in enumerate(HALVES):
         half = dataclasses.replace(effort, samples=max(1, effort.samples // 2), seed=effort.seed ^ salt)
@@ -165,7 +167,7 @@ def fitted(scene: Scene, state: State, threads: int) -> np.ndarray:
     return np.concatenate(parts, axis=1)
 
 
-def squared_errors(state: State, judge: Judge, threads: int) -> np.ndarray:
+def squared_errors(state: State, judge: Judge, threads: int) -> tuple[np.ndarray, np.ndarray]:
     """Estimate the squared error of what receivers see, relative to the light there.
 
     Parameters
@@ -179,8 +181,10 @@ def squared_errors(state: State, judge: Judge, threads: int) -> np.ndarray:
 
     Returns
     -------
-    (n,) float64 ndarray
+    squared : (n,) float32 ndarray
         Right on average, so that single ones may be negative.
+    noise : (n,) float32 ndarray
+        Squared noise of the light at the receiver, relative likewise: it says how far to trust `squared`.
     """
     use, system = _system(state)
     stored = _views(np.moveaxis(state.measured.light, 1, 2), judge)
@@ -193,8 +197,10 @@ def squared_errors(state: State, judge: Judge, threads: int) -> np.ndarray:
     if len(use):
         share = fit_error.leverage(system, prior)
         squared[use] = fit_error.squared_error(system, stored, halves[:, use], share).sum(axis=(1, 2))
+    noise = ((halves[0] - halves[1]) ** 2).sum(axis=(1, 2)) / 4
     bright, typical = brightness(state.seen, judge)
-    return squared / np.maximum(bright**2 + (DARK * typical) ** 2, 1e-30)
+    scale = np.maximum(bright**2 + (DARK * typical) ** 2, 1e-30)
+    return squared / scale, noise / scale
 
 
 def brightness(seen: Seen, judge: Judge) -> tuple[np.ndarray, float]:
@@ -216,6 +222,33 @@ def brightness(seen: Seen, judge: Judge) -> tuple[np.ndarray, float]:
     """
     bright = _looked_at(seen.light.mean(axis=0), judge.mean)
     return bright, float((bright * seen.at.area).sum() / max(float(seen.at.area.sum()), 1e-30))
+
+
+def shade(state: State, light: np.ndarray, judge: Judge) -> float:
+    """Fit how dark it is where receivers see none of the data points that could light them.
+
+    Parameters
+    ----------
+    state : State
+        A cell.
+    light : (points, functions, 9, 3) float32 ndarray
+        What is stored.
+    judge : Judge
+        Its mean view counts.
+
+    Returns
+    -------
+    float
+        Least-squares factor of the last resort's light, 0 to 1; 1 where no receiver needs it.
+    """
+    unlit = np.flatnonzero(confidence(state) < ENOUGH)
+    state = dataclasses.replace(state, seen=state.seen.take(unlit))
+    mixed = _views(np.moveaxis(light, 1, 2), Judge(judge.mean[None], judge.mean))
+    mixed = np.ascontiguousarray(np.moveaxis(mixed, 2, 1))
+    dark, full = (_received(_shaded(state, value), mixed)[:, 0, 0] for value in (0.0, 1.0))
+    wanted, given, area = brightness(state.seen, judge)[0] - dark, full - dark, state.seen.at.area
+    spread = float((area * given * given).sum())
+    return float(np.clip((area * wanted * given).sum() / spread, 0.0, 1.0)) if spread > 0 else 1.0
 
 
 def confidence(state: State) -> np.ndarray:
@@ -254,6 +287,12 @@ def _fit(system: fit.System, traced: np.ndarray, halves: np.ndarray, threads: in
     return fit.fit(system, traced, halves.mean(axis=0), prior, _threads(threads))
 
 
+def _shaded(state: State, value: float) -> State:
+    """The cell with another shade."""
+    data = dataclasses.replace(state.data, shade=np.full_like(state.data.shade, value))
+    return dataclasses.replace(state, data=data)
+
+
 def _threads(threads: int) -> int:
     """0 stands for every core."""
     return threads or os.cpu_count() or 1
@@ -263,7 +302,7 @@ def _received(state: State, values: np.ndarray) -> np.ndarray:
     """(n, functions, 3) what the run time shows at the receivers."""
     at, count = state.seen.at, values.shape[1]
     flat = np.ascontiguousarray(values.reshape(len(values), -1))
-    mean = blend(state.data, flat, clamp(state.data, at.position), at.normal).reshape(-1, count, 9, 3)
+    mean = blend(state.data, flat, clamp(state.data, at.position), at.normal).reshape(len(at.key), count, 9, 3)
     basis = harmonics.basis(at.normal.astype(np.float64)).astype(np.float32)
     return np.maximum(np.einsum("nfkc,nk->nfc", mean, basis), 0.0)
 

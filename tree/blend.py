@@ -4,11 +4,14 @@ Comes in: values at all data points, points, normals. Goes out: their weighted m
 
     F_l(p) = (sum of weight * value + (ENOUGH - s)+ F_(l-1)(p)) / max(s, ENOUGH),    s = sum of weights
 
-over the stencil that starts at level l. F_-1, the last resort, has no cosine and no planes, and for voxels without a
-data point the nearest one stands in. The ramp keeps the value continuous where the last trusted data point fades out.
+over the stencil that starts at level l. F_-1, the last resort, has no cosine and no planes. Its values are multiplied
+with the cell's shade, as it is dark in cracks, and for voxels without a data point the nearest one stands in. The
+ramp keeps the value continuous where the last trusted data point fades out.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -19,6 +22,8 @@ __all__ = ["ENOUGH", "blend", "clamp"]
 
 ENOUGH = 0.02
 """Weights that sum to less are filled up: a twentieth of what one data point straight before a wall has."""
+DONE = -2
+"""Level of points that need no more."""
 FAR = 2.0**36
 """Points are clamped to this many first-level voxels, so that coordinates of all levels fit into int64."""
 
@@ -42,9 +47,23 @@ def blend(data: DataPoints, values: np.ndarray, points: np.ndarray, normals: np.
     (n, m) float32
         Weighted means; zeros in a bake without any valid data point.
     """
-    points = np.ascontiguousarray(points.T)
-    normals = np.ascontiguousarray(normals.T, np.float32)
-    return _fill(data, values, points, normals, data.grid.levels - 1)
+    points, normals = np.ascontiguousarray(points.T), np.ascontiguousarray(normals.T, np.float32)
+    result, count = np.zeros((points.shape[1], values.shape[1]), np.float32), points.shape[1]
+    due, share = np.full(count, data.grid.levels - 1), np.ones(count, np.float32)
+    for level in range(data.grid.levels - 1, -1, -1):
+        some = np.flatnonzero(due == level)
+        found = layers(data, _part(points, some), _part(normals, some), level)
+        sums, total, start = _accumulate(found, values, len(some))
+        left = np.maximum(ENOUGH - total, 0) / np.float32(ENOUGH)
+        left **= level - start + 1
+        scale = share[some] * (1 - left) / np.where(total > 0, total, 1)
+        share[some] *= left
+        due[some] = np.where(left > 0, start - 1, DONE)
+        _add(result, some, scale, sums)
+    some = np.flatnonzero(due > DONE)
+    sums, total, _ = _accumulate(last_resort(data, _part(points, some)), values, len(some))
+    _add(result, some, share[some] / np.where(total > 0, total, 1), sums)
+    return result
 
 
 def clamp(data: DataPoints, points: np.ndarray) -> np.ndarray:
@@ -66,8 +85,9 @@ def clamp(data: DataPoints, points: np.ndarray) -> np.ndarray:
     points = np.clip(points, -limit, limit)
     if not len(data.boxes):
         return points
-    voxel = np.floor(points * (1.0 / data.grid.first_size)).astype(np.int64)
-    outside = np.flatnonzero(data.atlas.find(0, voxel) < 0)
+    voxel = np.floor(points.T * (1.0 / data.grid.first_size)).astype(np.int64)
+    first = data.dual_cells[0]
+    outside = np.flatnonzero(first.corners[first.find(voxel), 0] < 0)
     step = max(1, PAIRS // len(data.boxes))
     for start in range(0, len(outside), step):
         part = outside[start : start + step]
@@ -77,40 +97,35 @@ def clamp(data: DataPoints, points: np.ndarray) -> np.ndarray:
     return points
 
 
-def _fill(data: DataPoints, values: np.ndarray, points: np.ndarray, normals: np.ndarray, level: int) -> np.ndarray:
-    """F_level of the module's definition."""
-    if level < 0:
-        sums, total = _accumulate(last_resort(data, points), values, points.shape[1])
-        return sums / np.where(total > 0, total, 1)[:, None]
-    sums, total = _accumulate(layers(data, points, normals, level), values, points.shape[1])
-    low = np.flatnonzero(total < ENOUGH)
-    if len(low):
-        rest = _fill(data, values, points[:, low], normals[:, low], level - 1)
-        sums[low] += (ENOUGH - total[low, None]) * rest
-        total[low] = ENOUGH
-    sums /= total[:, None]
-    return sums
+def _part(rows: np.ndarray, some: np.ndarray) -> np.ndarray:
+    """Some columns."""
+    return rows if len(some) == rows.shape[1] else np.take(rows, some, axis=1)
 
 
-def _accumulate(found, values: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted sums of values, and of weights, over all taps of each point."""
+def _add(result: np.ndarray, some: np.ndarray, scale: np.ndarray, sums: np.ndarray) -> None:
+    """Add scaled sums to some rows."""
+    sums *= scale[:, None]
+    if len(some) == len(result):
+        result += sums
+    else:
+        result[some] += sums
+
+
+def _accumulate(found: Iterable[Taps], values: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Weighted sums of values, sums of weights, and the finest level with taps, over all taps of each point."""
     sums, total = np.zeros((count, values.shape[1]), np.float32), np.zeros(count, np.float32)
+    start = np.full(count, -1)
     for part in found:
-        if len(part.point) == count:
-            sums += _weighted(part, values)
-            total += part.weight.sum(axis=0)
-        else:
-            sums[part.point] += _weighted(part, values)
-            total[part.point] += part.weight.sum(axis=0)
-    return sums, total
-
-
-def _weighted(part: Taps, values: np.ndarray) -> np.ndarray:
-    """Weighted sum of values over the eight corners."""
-    sums = np.zeros((len(part.point), values.shape[1]), np.float32)
-    read = np.empty_like(sums)
-    for row, weight in zip(part.row, part.weight, strict=True):
-        np.take(values, row, axis=0, out=read, mode="clip")
-        read *= weight[:, None]
-        sums += read
-    return sums
+        start[part.point] = np.maximum(start[part.point], part.level)
+        for row, weight in zip(part.row, part.weight, strict=True):
+            used = np.flatnonzero(weight)
+            weight, point = weight[used], part.point[used]
+            read = np.take(values, row[used], axis=0, mode="clip")
+            read *= weight[:, None]
+            if len(used) == count:
+                sums += read
+                total += weight
+            else:
+                sums[point] += read
+                total[point] += weight
+    return sums, total, np.maximum(start, 0)

@@ -138,7 +138,8 @@ def write_cell(
     arrays = {"offset": np.where(valid[:, None], offsets, 0).astype(np.int8), "valid": valid.astype(bool)}
     arrays |= {"planes": np.where(valid[:, None], planes.planes, NONE).astype(np.uint16), "plane": planes.plane}
     units = {"offset": f"voxel size / {OFFSET_STEPS}", "plane": "1, 1, 1, m, m"}
-    sizes[POINTS] = container.write(cell_path(folder, cell, POINTS), POINTS, arrays, common, units)
+    own = common | {"shade": planes.shade}
+    sizes[POINTS] = container.write(cell_path(folder, cell, POINTS), POINTS, arrays, own, units)
     for name in PAYLOADS:
         path = cell_path(folder, cell, name)
         if name in payloads:
@@ -252,7 +253,7 @@ def read_cell(folder: str | os.PathLike, cell: tuple[int, int]) -> Cell:
     if shapes != [((topology.size, 3), "|i1"), ((topology.size,), "|b1")]:
         reason = f"the data points do not fit a tree of {topology.size} voxels"
         raise FileError(cell_path(folder, cell, POINTS), container.PREFIX_BYTES, reason)
-    planes = _read_planes(cell_path(folder, cell, POINTS), points.arrays, valid)
+    planes = _read_planes(cell_path(folder, cell, POINTS), points, valid)
     payloads = {}
     for name in (name for name in PAYLOADS if name in meta["files"]):
         payloads[name], header = payload.read_payload(cell_path(folder, cell, name))
@@ -323,11 +324,11 @@ def _check_belongs(path: Path, meta: dict, own: dict) -> None:
             raise FileError(path, container.PREFIX_BYTES, reason)
 
 
-def _read_planes(path: Path, arrays: dict[str, np.ndarray], valid: np.ndarray) -> CellPlanes:
+def _read_planes(path: Path, file: container.Container, valid: np.ndarray) -> CellPlanes:
     """The planes of a file of data points; those without a data point have none."""
-    if "planes" not in arrays or "plane" not in arrays:
+    if "planes" not in file.arrays or "plane" not in file.arrays:
         raise FileError(path, container.PREFIX_BYTES, "the data points have no occluding planes")
-    planes = CellPlanes(arrays["planes"], arrays["plane"])
+    planes = CellPlanes(file.arrays["planes"], file.arrays["plane"], file.meta.get("shade"))
     reason = planes_defect(planes, len(valid))
     if not reason and (planes.planes[~valid] != NONE).any():
         reason = "a voxel without a data point has occluding planes"

@@ -36,6 +36,8 @@ class DualCells:
     ----------
     corners : (c, 8) int32
         Rows of each dual cell's corners, -1 where the voxel does not exist; row 0 is -1 throughout.
+    whole : (c,) bool
+        Whether all corners exist.
     """
 
     def __init__(self, coords: np.ndarray, rows: np.ndarray):
@@ -50,6 +52,7 @@ class DualCells:
             self._blocks.append(block)
         self.corners = np.full((int(number.max(initial=0)) + 1, 8), -1, np.int32)
         self.corners[number.reshape(-1, 8), np.arange(8)] = rows[:, None]
+        self.whole = (self.corners >= 0).all(axis=1)
 
     def find(self, base: np.ndarray) -> np.ndarray:
         """Return the number of dual cells.
@@ -64,23 +67,28 @@ class DualCells:
         (n,) int64
             Row of `corners`; 0 where no corner exists.
         """
-        place = [(base[axis] >> 2 * self._depth) - self._low[axis] for axis in range(3)]
-        inside = np.ones(base.shape[1], bool)
-        for axis in range(3):
-            inside &= (place[axis] >= 0) & (place[axis] < self._shape[axis])
-        number = np.where(inside, self._root[np.where(inside, _pack(place, self._shape), 0)], 0)
+        number = self._root.take(self._root_key(base))
         for stage, block in zip(range(self._depth - 1, -1, -1), self._blocks, strict=True):
-            number = block[number * 64 + _step(base, stage)]
+            number = block.take((number << 6) + _step(base, stage))
         return number
+
+    def _root_key(self, base: np.ndarray) -> np.ndarray:
+        """Which root each dual cell lies in; all outside of the box lie in the empty ones around it."""
+        key = 0
+        for axis in (2, 1, 0):
+            place = (base[axis] >> 2 * self._depth) - self._low[axis]
+            np.clip(place, 0, self._shape[axis] - 1, out=place)
+            key = key * self._shape[axis] + place
+        return key
 
 
 def _root_box(base: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-    """Lowest root, number of roots along each axis, and how many levels of blocks make the roots few."""
+    """Lowest root, number of roots along each axis, and how many levels of blocks make them few; a border is empty."""
     low, high = (base.min(axis=0), base.max(axis=0)) if len(base) else (np.zeros(3, int), np.zeros(3, int))
-    depth = 0
-    while np.prod(((high >> 2 * depth) - (low >> 2 * depth) + 1).astype(float)) > ROOTS or depth < 2:
+    depth = 1
+    while np.prod(((high >> 2 * depth) - (low >> 2 * depth) + 3).astype(float)) > ROOTS:
         depth += 1
-    return low >> 2 * depth, (high >> 2 * depth) - (low >> 2 * depth) + 1, depth
+    return (low >> 2 * depth) - 1, (high >> 2 * depth) - (low >> 2 * depth) + 3, depth
 
 
 def _pack(place, shape: np.ndarray) -> np.ndarray:
@@ -91,7 +99,11 @@ def _pack(place, shape: np.ndarray) -> np.ndarray:
 def _step(base: np.ndarray, stage: int) -> np.ndarray:
     """Which of a block's 64 entries lies on the way."""
     x, y, z = (base[axis] >> 2 * stage & 3 for axis in range(3))
-    return x | y << 2 | z << 4
+    y <<= 2
+    z <<= 4
+    x |= y
+    x |= z
+    return x
 
 
 def _number(key: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:

@@ -60,6 +60,8 @@ class DataPoints:
         does not see the data points that use it.
     boxes : (cells, 2, 3) float64
         Lowest and highest corner of each cell's dense grid, relative to the origin [m].
+    shade : (n,) float32
+        What counts of a data point where none is seen, 0 to 1; the same all over a cell.
     """
 
     grid: Grid
@@ -71,6 +73,7 @@ class DataPoints:
     planes: np.ndarray
     plane: np.ndarray
     boxes: np.ndarray
+    shade: np.ndarray
 
     @cached_property
     def size(self) -> np.ndarray:
@@ -137,6 +140,7 @@ def join(
     valid: np.ndarray,
     planes: np.ndarray | None = None,
     plane: np.ndarray | None = None,
+    shade: np.ndarray | None = None,
 ) -> DataPoints:
     """Join the data points of some cells, which may be one.
 
@@ -154,6 +158,8 @@ def join(
         Rows of `plane`, -1 for none; no planes at all when left out.
     plane : (m, 5) float64, optional
         As in `DataPoints`.
+    shade : (cells,) float, optional
+        Shade of each cell; 1 when left out.
 
     Returns
     -------
@@ -168,7 +174,9 @@ def join(
     planes = np.full((len(level), PLANES), -1, np.int32) if planes is None else planes
     plane = np.zeros((0, 5)) if plane is None else plane
     boxes = np.stack([low, high], axis=1) * grid.first_size
-    return DataPoints(grid, Atlas(topologies), level, coords, offset, valid, planes, plane, boxes)
+    shade = np.repeat(np.ones(len(topologies)) if shade is None else shade, [t.size for t in topologies])
+    shade = shade.astype(np.float32)
+    return DataPoints(grid, Atlas(topologies), level, coords, offset, valid, planes, plane, boxes, shade)
 
 
 def layers(data: DataPoints, points: np.ndarray, normals: np.ndarray, finest: int | None = None) -> Iterator[Taps]:

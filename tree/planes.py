@@ -35,10 +35,13 @@ class CellPlanes:
         Rows of `plane`, `NONE` after the last one.
     plane : (m, 5) float32
         Unit normal, distance from the cell's corner along it [m], width [m].
+    shade : float
+        0 to 1: what is left of the first level's light where no data point is seen, in cracks.
     """
 
     planes: np.ndarray
     plane: np.ndarray
+    shade: float = 1.0
 
 
 def empty(size: int) -> CellPlanes:
@@ -57,7 +60,9 @@ def empty(size: int) -> CellPlanes:
     return CellPlanes(np.full((size, SLOTS), NONE, np.uint16), np.zeros((0, COLUMNS), np.float32))
 
 
-def of_cell(planes: np.ndarray, plane: np.ndarray, position: np.ndarray, corner: np.ndarray) -> CellPlanes:
+def of_cell(
+    planes: np.ndarray, plane: np.ndarray, position: np.ndarray, corner: np.ndarray, shade: float = 1.0
+) -> CellPlanes:
     """Take the planes that one cell's data points use.
 
     Parameters
@@ -70,6 +75,8 @@ def of_cell(planes: np.ndarray, plane: np.ndarray, position: np.ndarray, corner:
         The data points, relative to the origin [m].
     corner : (3,) float64
         The cell's corner, (i, j, 0) times the cell's size [m].
+    shade : float
+        As in `CellPlanes`.
 
     Returns
     -------
@@ -92,7 +99,7 @@ def of_cell(planes: np.ndarray, plane: np.ndarray, position: np.ndarray, corner:
     number = np.full(len(plane) + 1, NONE, np.uint16)
     number[used[kept]] = np.arange(len(kept), dtype=np.uint16)
     rows = np.sort(number[planes], axis=1) if len(kept) < len(used) else number[planes]
-    return CellPlanes(rows, table)
+    return CellPlanes(rows, table, shade)
 
 
 def join(cells: Sequence[CellPlanes], corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -153,4 +160,6 @@ def planes_defect(cell: CellPlanes, size: int) -> str:
         return "a plane's normal is not of unit length"
     if (plane[:, 4] <= 0).any():
         return "a plane's width is not positive"
+    if type(cell.shade) not in (int, float) or not 0 <= cell.shade <= 1:
+        return f"the shade {cell.shade!r} is no number from 0 to 1"
     return ""

@@ -43,15 +43,15 @@ class Taps:
         Linear weights; over all levels they sum to 1 for each point, less what lies outside the first level.
     place : (3, m) float32
         The point, relative to the centre of the first corner [voxels of the level].
-    size : float
-        Voxel size [m].
+    level : int
+        The level.
     """
 
     point: np.ndarray
     row: np.ndarray
     weight: np.ndarray
     place: np.ndarray
-    size: float
+    level: int
 
 
 def taps(grid: Grid, levels: list[DualCells], points: np.ndarray, finest: int) -> Iterator[Taps]:
@@ -84,28 +84,44 @@ def taps(grid: Grid, levels: list[DualCells], points: np.ndarray, finest: int) -
         if not len(point):
             return
         size = float(grid.voxel_size(level))
-        base = center * (1.0 / size) - 0.5
-        place = base.copy()
-        np.floor(base, out=base)
+        place = center * (1.0 / size) - 0.5
+        base = np.floor(place)
         number = levels[level].find(base.astype(np.int64))
-        row = np.ascontiguousarray(np.take(levels[level].corners, number, axis=0).T)
-        weight = _trilinear((place - base).astype(np.float32), share)
-        missing = weight * (row < 0)
-        if number.any():
-            yield _taps(point, points, row, weight - missing, base, size, number)
-        point, center, share = _onward(point, center, base, missing, number, size)
+        bare, touched = np.flatnonzero(number == 0), np.flatnonzero(number)
+        rest = [(point[bare], center[:, bare], share[bare])] if len(bare) else []
+        if len(touched):
+            if len(bare):
+                point, place, base, share = point[touched], place[:, touched], base[:, touched], share[touched]
+                number = number[touched]
+            row = np.ascontiguousarray(np.take(levels[level].corners, number, axis=0).T)
+            weight = _trilinear((place - base).astype(np.float32), share)
+            rest += _onward(point, base, row, weight, ~levels[level].whole[number], size)
+            yield Taps(point, np.maximum(row, 0, out=row), weight, _place(points, point, base, size), level)
+        if not rest:
+            return
+        point, center, share = (np.concatenate(parts, axis=-1) for parts in zip(*rest, strict=True))
 
 
-def _onward(point, center: np.ndarray, base: np.ndarray, missing: np.ndarray, number: np.ndarray, size: float):
-    """Points whose corners are not all there: where the coarser level is evaluated, and with what weight."""
-    share = missing.sum(axis=0)
-    on = np.flatnonzero(share > NOTHING)
-    share = share[on]
-    moved = CORNERS.T.astype(np.float32) @ missing[:, on]
-    moved = (base[:, on] + 0.5 + moved / share) * size
-    bare = np.flatnonzero(number[on] == 0)
-    moved[:, bare] = center[:, on[bare]]
-    return point[on], moved, share
+def _onward(point, base: np.ndarray, row: np.ndarray, weight: np.ndarray, partial: np.ndarray, size: float) -> list:
+    """Takes weight from missing corners: the points that have some, where the coarser level counts, and how much."""
+    some = np.flatnonzero(partial)
+    if not len(some):
+        return []
+    missing = weight[:, some] * (row[:, some] < 0)
+    weight[:, some] -= missing
+    faces = [[missing[corner] for corner in np.flatnonzero(CORNERS[:, axis])] for axis in range(3)]
+    share = _sum(missing)
+    on = share > NOTHING
+    moved = np.stack([_sum(face) for face in faces]) / np.where(on, share, 1)
+    return [(point[some[on]], (base[:, some[on]] + 0.5 + moved[:, on]) * size, share[on])]
+
+
+def _sum(parts) -> np.ndarray:
+    """Sum in a fixed order, so that results do not depend on how many points there are."""
+    total = parts[0] + parts[1]
+    for part in parts[2:]:
+        total += part
+    return total
 
 
 def _trilinear(place: np.ndarray, share: np.ndarray) -> np.ndarray:
@@ -115,11 +131,7 @@ def _trilinear(place: np.ndarray, share: np.ndarray) -> np.ndarray:
     return (yz[:, :, None] * x).reshape(8, -1)
 
 
-def _taps(point, points: np.ndarray, row, weight, base, size: float, number: np.ndarray) -> Taps:
-    """Taps of the points that some corner exists for."""
-    if not number.all():
-        touched = np.flatnonzero(number)
-        point, row, weight, base = point[touched], row[:, touched], weight[:, touched], base[:, touched]
+def _place(points: np.ndarray, point: np.ndarray, base: np.ndarray, size: float) -> np.ndarray:
+    """Points relative to the centres of the first corners [voxels]."""
     at = points if len(point) == points.shape[1] else points[:, point]
-    place = at * (1.0 / size) - 0.5 - base
-    return Taps(point, np.maximum(row, 0), weight, place.astype(np.float32), size)
+    return (at * (1.0 / size) - 0.5 - base).astype(np.float32)

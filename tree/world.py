@@ -244,7 +244,8 @@ def _data_points(grid: Grid, cells: list[folder.Cell]) -> DataPoints:
     valid = np.concatenate([np.zeros(0, bool), *(cell.valid for cell in cells)])
     corners = np.array([[*cell.topology.cell, 0] for cell in cells], np.float64).reshape(-1, 3) * grid.cell_size
     occluders = planes.join([cell.planes for cell in cells], corners)
-    return join(grid, [cell.topology for cell in cells], offset, valid, *occluders)
+    shade = np.array([cell.planes.shade for cell in cells])
+    return join(grid, [cell.topology for cell in cells], offset, valid, *occluders, shade)
 
 
 def _join(name: str, cells: list[folder.Cell], atlas: Atlas) -> Values:
