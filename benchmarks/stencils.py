@@ -171,7 +171,7 @@ def _taps(data: DataPoints, points: np.ndarray, normals: np.ndarray, level: int,
     total = np.zeros(points.shape[1])
     for part in found:
         total[part.point] += part.weight.sum(axis=0)
-    scale = share / (np.maximum(total, blend.ENOUGH) if level >= 0 else np.where(total > 0, total, 1.0))
+    scale = share / np.maximum(total, blend.ENOUGH) if level >= 0 else share
     for part in found:
         corner, column = np.nonzero(part.weight > 0)
         point = part.point[column]

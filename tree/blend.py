@@ -61,8 +61,7 @@ def blend(data: DataPoints, values: np.ndarray, points: np.ndarray, normals: np.
         due[some] = np.where(left > 0, start - 1, DONE)
         _add(result, some, scale, sums)
     some = np.flatnonzero(due > DONE)
-    sums, total, _ = _accumulate(last_resort(data, _part(points, some)), values, len(some))
-    _add(result, some, share[some] / np.where(total > 0, total, 1), sums)
+    _add(result, some, share[some], _accumulate(last_resort(data, _part(points, some)), values, len(some))[0])
     return result
 
 

@@ -212,7 +212,7 @@ def layers(data: DataPoints, points: np.ndarray, normals: np.ndarray, finest: in
 
 
 def last_resort(data: DataPoints, points: np.ndarray) -> Iterator[Taps]:
-    """Find what lights points that no data point can be trusted for: the first level by linear weights.
+    """Find what lights points where no data point can be trusted: the first level without cosine and planes.
 
     Parameters
     ----------
@@ -224,15 +224,17 @@ def last_resort(data: DataPoints, points: np.ndarray) -> Iterator[Taps]:
     Yields
     ------
     Taps
-        At most once. The nearest valid data points stand in for voxels that have none, so that this is continuous
-        too; no weight in a bake whose first level has none at all.
+        At most once, with weights that sum to the shade. The nearest valid data points stand in for voxels that have
+        none, so that this is continuous too; without any on the first level all weights are 0.
     """
     for found in taps(data.grid, data.dual_cells, points, 0):
-        used = found.weight > 0
+        weight, used = found.weight, found.weight > 0
         if len(data.first_level):
             found.row[used] = data.stand_in(found.row[used])
+            weight /= np.where(used.any(axis=0), weight.sum(axis=0), 1)
+            weight *= data.shade[found.row]
         else:
-            found.weight[:] = 0.0
+            weight[:] = 0.0
         yield found
 
 

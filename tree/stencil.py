@@ -78,45 +78,54 @@ def taps(grid: Grid, levels: list[DualCells], points: np.ndarray, finest: int) -
     Error: linear fields to rounding, continuous; `tests/tree/test_stencil.py`.
     Source: row 9 of the talk; evaluating the coarse level at the centroid is ours.
     """
-    point, center = np.arange(points.shape[1]), points
+    point, center = np.arange(points.shape[1]), points.copy()
     share = np.ones(points.shape[1], np.float32)
     for level in range(finest, -1, -1):
-        if not len(point):
-            return
         size = float(grid.voxel_size(level))
         place = center * (1.0 / size) - 0.5
         base = np.floor(place)
         number = levels[level].find(base.astype(np.int64))
-        bare, touched = np.flatnonzero(number == 0), np.flatnonzero(number)
-        rest = [(point[bare], center[:, bare], share[bare])] if len(bare) else []
+        goes_on, touched = number == 0, np.flatnonzero(number)
         if len(touched):
-            if len(bare):
-                point, place, base, share = point[touched], place[:, touched], base[:, touched], share[touched]
-                number = number[touched]
-            row = np.ascontiguousarray(np.take(levels[level].corners, number, axis=0).T)
-            weight = _trilinear((place - base).astype(np.float32), share)
-            rest += _onward(point, base, row, weight, ~levels[level].whole[number], size)
-            yield Taps(point, np.maximum(row, 0, out=row), weight, _place(points, point, base, size), level)
-        if not rest:
+            corners = _corners(levels[level], place, base, share, number, touched)
+            used, base = _part(point, touched), _part(base, touched)
+            some, moved, missing = _missing(corners, base, size)
+            some = touched[some]
+            center[:, some], share[some], goes_on[some] = moved, missing, True
+            row = np.maximum(corners[0], 0, out=corners[0])
+            yield Taps(used, row, corners[1], _place(points, used, base, size), level)
+        rest = np.flatnonzero(goes_on)
+        if not level or not len(rest):
             return
-        point, center, share = (np.concatenate(parts, axis=-1) for parts in zip(*rest, strict=True))
+        point, center, share = _part(point, rest), _part(center, rest), _part(share, rest)
 
 
-def _onward(point, base: np.ndarray, row: np.ndarray, weight: np.ndarray, partial: np.ndarray, size: float) -> list:
-    """Takes weight from missing corners: the points that have some, where the coarser level counts, and how much."""
-    some = np.flatnonzero(partial)
-    if not len(some):
-        return []
+def _part(values: np.ndarray, some: np.ndarray) -> np.ndarray:
+    """Some of the points, in their order."""
+    return values if len(some) == values.shape[-1] else np.take(values, some, axis=-1)
+
+
+def _corners(cells: DualCells, place, base, share, number, touched: np.ndarray) -> tuple[np.ndarray, ...]:
+    """(8, m) rows and linear weights of dual cells that have corners, and whether all of them exist."""
+    number = _part(number, touched)
+    row = np.ascontiguousarray(np.take(cells.corners, number, axis=0).T)
+    weight = _trilinear(_part(place - base, touched).astype(np.float32), _part(share, touched))
+    return row, weight, cells.whole[number]
+
+
+def _missing(corners: tuple[np.ndarray, ...], base: np.ndarray, size: float) -> tuple[np.ndarray, ...]:
+    """Take weight from missing corners: which points lack some, their centroids, and how much they weigh."""
+    row, weight, whole = corners
+    some = np.flatnonzero(~whole)
     missing = weight[:, some] * (row[:, some] < 0)
     weight[:, some] -= missing
-    faces = [[missing[corner] for corner in np.flatnonzero(CORNERS[:, axis])] for axis in range(3)]
     share = _sum(missing)
-    on = share > NOTHING
-    moved = np.stack([_sum(face) for face in faces]) / np.where(on, share, 1)
-    return [(point[some[on]], (base[:, some[on]] + 0.5 + moved[:, on]) * size, share[on])]
+    on = np.flatnonzero(share > NOTHING)
+    moved = np.stack([_sum(missing[CORNERS[:, axis] == 1]) for axis in range(3)])
+    return some[on], (_part(base, some[on]) + 0.5 + moved[:, on] / share[on]) * size, share[on]
 
 
-def _sum(parts) -> np.ndarray:
+def _sum(parts: np.ndarray) -> np.ndarray:
     """Sum in a fixed order, so that results do not depend on how many points there are."""
     total = parts[0] + parts[1]
     for part in parts[2:]:
@@ -133,5 +142,4 @@ def _trilinear(place: np.ndarray, share: np.ndarray) -> np.ndarray:
 
 def _place(points: np.ndarray, point: np.ndarray, base: np.ndarray, size: float) -> np.ndarray:
     """Points relative to the centres of the first corners [voxels]."""
-    at = points if len(point) == points.shape[1] else points[:, point]
-    return (at * (1.0 / size) - 0.5 - base).astype(np.float32)
+    return (_part(points, point) * (1.0 / size) - 0.5 - base).astype(np.float32)

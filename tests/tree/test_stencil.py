@@ -25,7 +25,7 @@ def moments(data, points):
     points = np.ascontiguousarray(points.T)
     total, first, bits = np.zeros(points.shape[1]), np.zeros(points.shape), np.zeros(points.shape[1], np.int64)
     for part in taps(data.grid, data.dual_cells, points, data.grid.levels - 1):
-        level = int(np.round(np.log(data.grid.first_size / part.size) / np.log(4)))
+        level = part.level
         assert (data.level[part.row[part.weight > 0]] == level).all()
         total[part.point] += part.weight.sum(axis=0)
         for axis in range(3):
@@ -79,14 +79,14 @@ def test_taps_are_those_of_the_definition(name, dilation):
 
 
 def test_a_stencil_that_ignores_the_centroid_is_caught(monkeypatch):
-    """A planted error: the coarse level is evaluated at the point itself."""
-    onward = stencil._onward
+    """A planted error: the coarse level is evaluated half a voxel away from it."""
+    missing = stencil._missing
 
-    def planted(point, center, base, missing, number, size):
-        on, _, share = onward(point, center, base, missing, number, size)
-        return on, center[:, np.isin(point, on)], share
+    def planted(corners, base, size):
+        some, moved, share = missing(corners, base, size)
+        return some, moved + size / 2, share
 
-    monkeypatch.setattr(stencil, "_onward", planted)
+    monkeypatch.setattr(stencil, "_missing", planted)
     data = bakes.plain("soup")
     points = bakes.points(data, 5000)
     whole = surrounded(bakes.grown("soup")[0], data.grid, points)
@@ -96,8 +96,7 @@ def test_a_stencil_that_ignores_the_centroid_is_caught(monkeypatch):
 def test_a_coarser_start_is_the_tree_without_its_finer_levels():
     data = bakes.plain("soup")
     points = np.ascontiguousarray(bakes.points(data, 3000).T)
-    for part in taps(data.grid, data.dual_cells, points, 1):
-        assert part.size >= data.grid.voxel_size(1)
+    assert [part.level for part in taps(data.grid, data.dual_cells, points, 1)] == [1, 0]
     parts = list(taps(data.grid, data.dual_cells, points, 0))
     assert len(parts) == 1
     base = np.floor(points[:, parts[0].point].T / data.grid.first_size - 0.5).astype(np.int64)
