@@ -16,7 +16,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from .interpolate import PAIRS, DataPoints, last_resort, layers
-from .stencil import Taps
+from .stencil import Taps, in_order
 
 __all__ = ["ENOUGH", "blend", "clamp"]
 
@@ -116,15 +116,10 @@ def _accumulate(found: Iterable[Taps], values: np.ndarray, count: int) -> tuple[
     start = np.full(count, -1)
     for part in found:
         start[part.point] = np.maximum(start[part.point], part.level)
-        for row, weight in zip(part.row, part.weight, strict=True):
-            used = np.flatnonzero(weight)
-            weight, point = weight[used], part.point[used]
+        total[part.point] += in_order(part.weight)
+        for row, weight, counts in zip(part.row, part.weight, part.weight > 0, strict=True):
+            used = np.flatnonzero(counts)
             read = np.take(values, row[used], axis=0, mode="clip")
-            read *= weight[:, None]
-            if len(used) == count:
-                sums += read
-                total += weight
-            else:
-                sums[point] += read
-                total[point] += weight
+            read *= weight[used, None]
+            sums[part.point[used]] += read
     return sums, total, np.maximum(start, 0)

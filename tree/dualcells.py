@@ -34,7 +34,7 @@ class DualCells:
 
     Attributes
     ----------
-    corners : (c, 8) int32
+    corners : (c, 8) int64
         Rows of each dual cell's corners, -1 where the voxel does not exist; row 0 is -1 throughout.
     whole : (c,) bool
         Whether all corners exist.
@@ -50,7 +50,7 @@ class DualCells:
             size = (int(number.max(initial=0)) + 1) * 64
             number, block = _number(number * 64 + _step(base.T, stage), size)
             self._blocks.append(block)
-        self.corners = np.full((int(number.max(initial=0)) + 1, 8), -1, np.int32)
+        self.corners = np.full((int(number.max(initial=0)) + 1, 8), -1, np.int64)
         self.corners[number.reshape(-1, 8), np.arange(8)] = rows[:, None]
         self.whole = (self.corners >= 0).all(axis=1)
 

@@ -276,32 +276,32 @@ def weigh(data: DataPoints, points: np.ndarray, normals: np.ndarray) -> tuple[np
 def _face(data: DataPoints, found: Taps, normals: np.ndarray) -> None:
     """Multiply weights with the cosine between the normal and the way to the data point, 0 behind the surface."""
     lift = np.where(normals.any(axis=0), np.float32(NEAR), ANY)
-    for corner in range(8):
-        row = found.row[corner]
-        height, squared = lift.copy(), np.full(len(row), NEAR * NEAR, np.float32)
+    for corner, row in enumerate(found.row):
+        height, squared = lift.copy(), np.full(len(lift), NEAR * NEAR, np.float32)
         for axis in range(3):
-            arm = data.shift[axis][row]
-            arm += np.float32(CORNERS[corner, axis])
-            arm -= found.place[axis]
+            arm = data.shift[axis].take(row)
+            arm -= found.place[axis] - np.float32(CORNERS[corner, axis])
             height += normals[axis] * arm
-            squared += arm * arm
-        height /= np.sqrt(squared)
+            arm *= arm
+            squared += arm
+        height /= np.sqrt(squared, out=squared)
         found.weight[corner] *= np.clip(height, 0, 1, out=height)
 
 
 def _occlude(data: DataPoints, found: Taps, points: np.ndarray) -> None:
     """Multiply weights with what the data points' planes let through."""
-    corner, column = np.nonzero(data.has_planes[found.row] & (found.weight > 0))
-    if not len(corner):
+    flat = np.flatnonzero(data.has_planes.take(found.row) & (found.weight > 0))
+    if not len(flat):
         return
-    planes, at = data.planes[found.row[corner, column]], points[:, found.point[column]]
-    seen = np.ones(len(corner))
+    planes = data.planes.take(found.row.reshape(-1)[flat], axis=0)
+    at = points.take(found.point.take(flat % len(found.point)), axis=1)
+    seen = np.ones(len(flat))
     for number in range(PLANES):
         some = np.flatnonzero(planes[:, number] >= 0)
         plane = data.plane[planes[some, number]].T
         behind = sum(plane[axis] * at[axis, some] for axis in range(3)) - plane[3]
         seen[some] *= np.clip(1.0 + behind / plane[4], 0.0, 1.0)
-    found.weight[corner, column] *= seen.astype(np.float32)
+    found.weight.reshape(-1)[flat] *= seen.astype(np.float32)
 
 
 def _squared(a: np.ndarray, b: np.ndarray) -> np.ndarray:

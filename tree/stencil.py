@@ -23,7 +23,7 @@ import numpy as np
 from .dualcells import CORNERS, DualCells
 from .grid import Grid
 
-__all__ = ["Taps", "taps"]
+__all__ = ["Taps", "in_order", "taps"]
 
 NOTHING = 1e-9
 """Weight of missing corners below which they are rounding."""
@@ -37,7 +37,7 @@ class Taps:
     ----------
     point : (m,) int64
         Which points; each once.
-    row : (8, m) int32
+    row : (8, m) int64
         Rows of the data points, 0 where the weight is 0.
     weight : (8, m) float32
         Linear weights; over all levels they sum to 1 for each point, less what lies outside the first level.
@@ -100,6 +100,25 @@ def taps(grid: Grid, levels: list[DualCells], points: np.ndarray, finest: int) -
         point, center, share = _part(point, rest), _part(center, rest), _part(share, rest)
 
 
+def in_order(parts: np.ndarray) -> np.ndarray:
+    """Sum rows one after the other, so that results do not depend on how many columns there are.
+
+    Parameters
+    ----------
+    parts : (k, n) float32
+        At least two rows.
+
+    Returns
+    -------
+    (n,) float32
+        Their sum.
+    """
+    total = parts[0] + parts[1]
+    for part in parts[2:]:
+        total += part
+    return total
+
+
 def _part(values: np.ndarray, some: np.ndarray) -> np.ndarray:
     """Some of the points, in their order."""
     return values if len(some) == values.shape[-1] else np.take(values, some, axis=-1)
@@ -119,18 +138,10 @@ def _missing(corners: tuple[np.ndarray, ...], base: np.ndarray, size: float) -> 
     some = np.flatnonzero(~whole)
     missing = weight[:, some] * (row[:, some] < 0)
     weight[:, some] -= missing
-    share = _sum(missing)
+    share = in_order(missing)
     on = np.flatnonzero(share > NOTHING)
-    moved = np.stack([_sum(missing[CORNERS[:, axis] == 1]) for axis in range(3)])
+    moved = np.stack([in_order(missing[CORNERS[:, axis] == 1]) for axis in range(3)])
     return some[on], (_part(base, some[on]) + 0.5 + moved[:, on] / share[on]) * size, share[on]
-
-
-def _sum(parts: np.ndarray) -> np.ndarray:
-    """Sum in a fixed order, so that results do not depend on how many points there are."""
-    total = parts[0] + parts[1]
-    for part in parts[2:]:
-        total += part
-    return total
 
 
 def _trilinear(place: np.ndarray, share: np.ndarray) -> np.ndarray:

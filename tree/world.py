@@ -258,9 +258,9 @@ def _check_rows(values: np.ndarray, what: str) -> np.ndarray:
     values = np.asarray(values, np.float64)
     if values.ndim != 2 or values.shape[1] != 3:
         raise ValueError(f"{what} have shape {values.shape}; (n, 3) is needed")
-    bad = ~np.isfinite(values).all(axis=1)
-    if bad.any():
-        raise ValueError(f"{what}: row {int(np.argmax(bad))} is not finite")
+    finite = np.isfinite(values)
+    if not finite.all():
+        raise ValueError(f"{what}: row {int(np.argmin(finite.all(axis=1)))} is not finite")
     return values
 
 
@@ -274,7 +274,8 @@ def _finite(value: object, what: str) -> np.ndarray:
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
     """Unit vectors; zero stays zero, and no length overflows."""
-    largest = np.abs(vectors).max(axis=1, keepdims=True)
-    vectors = vectors / np.where(largest > 0, largest, 1.0)
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return vectors / np.where(length > 0, length, 1.0)
+    x, y, z = np.abs(vectors.T)
+    largest = np.maximum(np.maximum(x, y), z)
+    x, y, z = vectors = vectors.T / np.where(largest > 0, largest, 1.0)
+    length = np.sqrt(x * x + y * y + z * z)
+    return (vectors / np.where(length > 0, length, 1.0)).T
