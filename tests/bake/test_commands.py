@@ -329,6 +329,25 @@ def test_a_value_that_cannot_be_baked_is_named_with_its_option(level, tmp_path, 
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_cap_below_the_first_level_of_voxels_is_refused_in_one_line(tmp_path):
+    said = call("bake", stored(tmp_path, yard()), "-o", tmp_path / "out", *QUICK, "--max-points", "3")
+    assert said.reason == "--max-points 3: cell 0,0 has 18 first-level voxels; allow as many data points at least"
+    assert not cells_only(tmp_path / "out")
+
+
+def test_limits_are_kept_and_what_they_leave_out_is_said(level, tmp_path):
+    words = ("--samples", "4", "--error", "0", "--finest", "1", "--threads", "2")
+    free = succeed("bake", level, "-o", tmp_path / "free", *words)
+    points, size = free["data_points"] // 2, sum(free["bytes"].values()) // 2
+    for option, limit, unit in (("--max-points", points, "data points"), ("--max-bytes", size, "bytes")):
+        found = succeed("bake", level, "-o", tmp_path / unit, *words, option, limit)
+        assert (found["data_points"] if unit == "data points" else sum(found["bytes"].values())) <= limit
+        left_out = [item for item in found["left_out"] if "voxels" in item["what"]]
+        assert len(left_out) == 1
+        assert f"{limit:,} {unit}" in left_out[0]["why"]
+    assert not [item for item in free["left_out"] if "voxels" in item["what"]]
+
+
 @pytest.mark.parametrize(
     ("text", "reason"),
     [("\n", "holds no directions"), ("1 0 1\n1 2\n", "want 3 finite"), ("0 0 1\n" * 65, "at most 64"), ("é", "want 3")],
@@ -357,6 +376,18 @@ def test_a_file_of_sun_directions_is_checked_before_the_bake(level, tmp_path, te
         ["bake", "level.giv", "-o", "out", "--cells", ""],
         ["bake", "level.giv", "-o", "out", "--cells", "0,0/1"],
         ["bake", "level.giv", "-o", "out", "--progress", "xml"],
+        ["bake", "level.giv", "-o", "out", "--error", "-0.1"],
+        ["bake", "level.giv", "-o", "out", "--error", "nan"],
+        ["bake", "level.giv", "-o", "out", "--error", "1.01"],
+        ["bake", "level.giv", "-o", "out", "--error", "small"],
+        ["bake", "level.giv", "-o", "out", "--max-points", "0"],
+        ["bake", "level.giv", "-o", "out", "--max-points", "65536"],
+        ["bake", "level.giv", "-o", "out", "--max-points", "1e3"],
+        ["bake", "level.giv", "-o", "out", "--max-bytes", "0"],
+        ["bake", "level.giv", "-o", "out", "--max-bytes", "2GB"],
+        ["bake", "level.giv", "-o", "out", "--max-bytes", "-5"],
+        ["bake", "level.giv", "-o", "out", "--dilation", "none"],
+        ["bake", "level.giv", "-o", "out", "--no-fit", "yes"],
         ["query", "out", "--points", "p.npy", "-o", "e.npy"],
         ["query", "out", "--points", "p.npy", "--normals", "n.npy", "-o", "e.npy", "--transport", "moon"],
         ["compare", "out", "-o", "seen.png", "--size", "12"],

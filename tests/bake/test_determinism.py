@@ -10,11 +10,15 @@ import sys
 import build_scenes
 import numpy as np
 import pytest
+from command_line import cells_only
 from gi_volumes.bake import gather as gathering
+from gi_volumes.bake import job
 from gi_volumes.bake.gather import CancelledError, Effort, gather
 from gi_volumes.bake.scene import Model, Scene, SunDirections, prepare
 from gi_volumes.bake.sensors import HarmonicsSensor, SurfaceSensor
+from gi_volumes.bake.settings import Settings
 from gi_volumes.bake.snapshot import Channel, Image, LightKind, Material, Texture
+from gi_volumes.tree import folder
 from statistics_checks import standard_error
 
 POINTS = 45
@@ -188,6 +192,7 @@ MANY_CHANNELS = """
 import hashlib
 import numpy as np
 from gi_volumes.bake import gather as gathering
+from gi_volumes.bake import job
 weights, values = np.random.default_rng(0).random((9, 4096), np.float32), None
 for responses, channels in ((9, 78), (9, 9), (1, 78), (1, 222), (9, 222)):
     values = np.random.default_rng(1).random((channels, 4096), np.float32)
@@ -213,3 +218,49 @@ def test_sums_over_samples_are_the_exact_sums_to_single_precision():
     found = gathering._project(weights.astype(np.float32), values.astype(np.float32), 3, 700)
     truth = np.einsum("rps,cps->prc", weights.reshape(9, 3, 700), values.reshape(6, 3, 700))
     assert np.abs(found - truth).max() < 700 * 2.0**-23
+
+
+HOUSE = Settings(samples=8, bounces=2, finest=0.5)
+CELLS = [(-1, -1), (-1, 0), (0, -1), (0, 0)]
+
+
+def house():
+    """Two rooms, one of them lit, where four world cells meet."""
+    parts = [
+        (build_scenes.plane(7.0), Material("ground", Channel((0.5, 0.4, 0.3)))),
+        (build_scenes.box((-3, -2.5, 0), (4, 3, 2.6)), Material("wall")),
+        (build_scenes.box((-2.8, -2.3, 0.1), (0.7, 2.8, 2.5), inward=True), Material("room")),
+        (build_scenes.box((0.9, -2.3, 0.1), (3.8, 2.8, 2.5), inward=True), Material("other room")),
+    ]
+    lamps = build_scenes.lamps(
+        {"position": (-1, 0.5, 2.0), "strength": (30, 20, 10)},
+        {"kind": LightKind.SUN, "frame": build_scenes.sun_frame((0.3, 0.4, 0.8)), "strength": (3, 3, 3)},
+    )
+    return build_scenes.snapshot(parts, lamps, (0.5, 0.7, 1))
+
+
+@pytest.fixture(scope="module")
+def house_baked(tmp_path_factory):
+    target = tmp_path_factory.mktemp("house")
+    job.bake(house(), target, HOUSE, threads=1)
+    return target
+
+
+def test_the_house_is_subdivided_fitted_and_has_planes_on_both_sides_of_its_borders(house_baked, tmp_path):
+    found = [folder.read_cell(house_baked, cell) for cell in CELLS]
+    assert len(folder.load_header(house_baked)["cells"]) == len(CELLS)
+    for cell in found:
+        level = cell.topology.voxels()[0]
+        assert level.max() == 2
+        assert (cell.planes.planes >= 0).any()
+    job.bake(house(), tmp_path, Settings(**{**vars(HOUSE), "fit": False}), threads=1)
+    other = folder.read_cell(tmp_path, (0, 0))
+    assert np.array_equal(other.topology.nodes, found[-1].topology.nodes)
+    for name in TRANSPORTS:
+        assert not np.array_equal(other.payloads[name].values(), found[-1].payloads[name].values())
+
+
+def test_threads_order_and_split_of_a_whole_bake_change_no_byte(house_baked, tmp_path):
+    for part in ([CELLS[3]], CELLS[1:3], [CELLS[0]]):
+        job.bake(house(), tmp_path, HOUSE, part, threads=2)
+    assert cells_only(tmp_path) == cells_only(house_baked)
