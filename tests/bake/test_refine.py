@@ -1,0 +1,44 @@
+"""Refinement of a cell: how it is stopped, and what it says of its progress."""
+
+from __future__ import annotations
+
+import pytest
+from command_line import yard
+from gi_volumes.bake import job
+from gi_volumes.bake.gather import CancelledError, Effort
+from gi_volumes.bake.refine import Target, refine
+from gi_volumes.bake.scene import prepare
+from gi_volumes.bake.settings import Settings, choose_grid, model
+from gi_volumes.tree.outline import outline
+
+
+def parts(error: float = 0.05):
+    """What refines the yard's only cell."""
+    snapshot, settings = yard(), Settings(samples=8, bounces=1, finest=0.5, error=error)
+    snapshot, light = model(snapshot, settings)
+    scene = prepare(snapshot, light)
+    grid = choose_grid(scene.soup.corners, snapshot.origin, settings.finest)
+    target = Target(error, settings.max_points, "partial", Effort(8, 1, 0, 1), 8)
+    return (
+        scene,
+        outline(scene.soup.corners, grid, (0, 0), by_light=error > 0),
+        job._judge(snapshot, settings, scene),
+        target,
+    )
+
+
+def test_progress_grows_from_0_to_at_most_1():
+    shares = []
+    refine(*parts(), lambda share: shares.append(share) or True)
+    assert shares == sorted(shares)
+    assert 0 <= shares[0] < shares[-1] <= 1
+
+
+def test_saying_no_at_any_time_stops_the_work_at_once():
+    shares = []
+    refine(*parts(), lambda share: shares.append(share) or True)
+    for calls in range(len(shares)):
+        said = []
+        with pytest.raises(CancelledError):
+            refine(*parts(), lambda share, said=said, calls=calls: said.append(share) or len(said) <= calls)
+        assert said == shares[: calls + 1]
