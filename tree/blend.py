@@ -16,7 +16,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from .interpolate import PAIRS, DataPoints, last_resort, layers
-from .stencil import Taps, in_order
+from .stencil import Taps, in_order, pick
 
 __all__ = ["ENOUGH", "blend", "clamp"]
 
@@ -48,20 +48,19 @@ def blend(data: DataPoints, values: np.ndarray, points: np.ndarray, normals: np.
         Weighted means; zeros in a bake without any valid data point.
     """
     points, normals = np.ascontiguousarray(points.T), np.ascontiguousarray(normals.T, np.float32)
-    result, count = np.zeros((points.shape[1], values.shape[1]), np.float32), points.shape[1]
-    due, share = np.full(count, data.grid.levels - 1), np.ones(count, np.float32)
+    count = points.shape[1]
+    result, share = np.zeros((count, values.shape[1]), np.float32), np.ones(count, np.float32)
+    due = np.full(count, data.grid.levels - 1)
     for level in range(data.grid.levels - 1, -1, -1):
         some = np.flatnonzero(due == level)
-        found = layers(data, _part(points, some), _part(normals, some), level)
-        sums, total, start = _accumulate(found, values, len(some))
-        left = np.maximum(ENOUGH - total, 0) / np.float32(ENOUGH)
-        left **= level - start + 1
-        scale = share[some] * (1 - left) / np.where(total > 0, total, 1)
+        found = list(layers(data, pick(points, some), pick(normals, some), level))
+        total, start = _trust(found, len(some))
+        left = (np.maximum(ENOUGH - total, 0) / np.float32(ENOUGH)) ** (level - start + 1)
+        _add(result, values, found, some, pick(share, some) * (1 - left) / np.where(total > 0, total, 1))
         share[some] *= left
         due[some] = np.where(left > 0, start - 1, DONE)
-        _add(result, some, scale, sums)
     some = np.flatnonzero(due > DONE)
-    _add(result, some, share[some], _accumulate(last_resort(data, _part(points, some)), values, len(some))[0])
+    _add(result, values, last_resort(data, pick(points, some)), some, share[some])
     return result
 
 
@@ -96,30 +95,22 @@ def clamp(data: DataPoints, points: np.ndarray) -> np.ndarray:
     return points
 
 
-def _part(rows: np.ndarray, some: np.ndarray) -> np.ndarray:
-    """Some columns."""
-    return rows if len(some) == rows.shape[1] else np.take(rows, some, axis=1)
+def _trust(found: list[Taps], count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Sums of weights, and the finest level with taps, of each point."""
+    total, start = np.zeros(count, np.float32), np.zeros(count, np.int64)
+    for taps in found:
+        total[taps.point] += in_order(taps.weight)
+        start[taps.point] = np.maximum(start[taps.point], taps.level)
+    return total, start
 
 
-def _add(result: np.ndarray, some: np.ndarray, scale: np.ndarray, sums: np.ndarray) -> None:
-    """Add scaled sums to some rows."""
-    sums *= scale[:, None]
-    if len(some) == len(result):
-        result += sums
-    else:
-        result[some] += sums
-
-
-def _accumulate(found: Iterable[Taps], values: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Weighted sums of values, sums of weights, and the finest level with taps, over all taps of each point."""
-    sums, total = np.zeros((count, values.shape[1]), np.float32), np.zeros(count, np.float32)
-    start = np.full(count, -1)
-    for part in found:
-        start[part.point] = np.maximum(start[part.point], part.level)
-        total[part.point] += in_order(part.weight)
-        for row, weight, counts in zip(part.row, part.weight, part.weight > 0, strict=True):
+def _add(result: np.ndarray, values: np.ndarray, found: Iterable[Taps], some: np.ndarray, scale: np.ndarray) -> None:
+    """Add weighted values of taps to some points' results; most weights are 0, behind the surface, and not read."""
+    for taps in found:
+        taps.weight[:] *= pick(scale, taps.point)
+        point = pick(some, taps.point)
+        for row, weight, counts in zip(taps.row, taps.weight, taps.weight > 0, strict=True):
             used = np.flatnonzero(counts)
-            read = np.take(values, row[used], axis=0, mode="clip")
-            read *= weight[used, None]
-            sums[part.point[used]] += read
-    return sums, total, np.maximum(start, 0)
+            read = np.take(values, row.take(used), axis=0, mode="clip")
+            read *= weight.take(used)[:, None]
+            result[point.take(used)] += read

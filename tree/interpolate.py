@@ -20,7 +20,7 @@ from .cells import OFFSET_STEPS
 from .dualcells import CORNERS, DualCells
 from .grid import Grid
 from .lookup import Atlas
-from .stencil import Taps, taps
+from .stencil import Taps, pick, taps
 from .topology import Topology
 
 __all__ = ["PLANES", "DataPoints", "join", "last_resort", "layers", "weigh"]
@@ -206,7 +206,7 @@ def layers(data: DataPoints, points: np.ndarray, normals: np.ndarray, finest: in
     for found in taps(data.grid, data.dual_cells, points, start):
         weight = found.weight
         weight *= data.valid[found.row]
-        _face(data, found, normals if len(found.point) == points.shape[1] else normals[:, found.point])
+        _face(data, found, pick(normals, found.point))
         _occlude(data, found, points)
         yield found
 

@@ -23,7 +23,7 @@ import numpy as np
 from .dualcells import CORNERS, DualCells
 from .grid import Grid
 
-__all__ = ["Taps", "in_order", "taps"]
+__all__ = ["Taps", "in_order", "pick", "taps"]
 
 NOTHING = 1e-9
 """Weight of missing corners below which they are rounding."""
@@ -88,7 +88,7 @@ def taps(grid: Grid, levels: list[DualCells], points: np.ndarray, finest: int) -
         goes_on, touched = number == 0, np.flatnonzero(number)
         if len(touched):
             corners = _corners(levels[level], place, base, share, number, touched)
-            used, base = _part(point, touched), _part(base, touched)
+            used, base = pick(point, touched), pick(base, touched)
             some, moved, missing = _missing(corners, base, size)
             some = touched[some]
             center[:, some], share[some], goes_on[some] = moved, missing, True
@@ -97,7 +97,7 @@ def taps(grid: Grid, levels: list[DualCells], points: np.ndarray, finest: int) -
         rest = np.flatnonzero(goes_on)
         if not level or not len(rest):
             return
-        point, center, share = _part(point, rest), _part(center, rest), _part(share, rest)
+        point, center, share = pick(point, rest), pick(center, rest), pick(share, rest)
 
 
 def in_order(parts: np.ndarray) -> np.ndarray:
@@ -119,16 +119,29 @@ def in_order(parts: np.ndarray) -> np.ndarray:
     return total
 
 
-def _part(values: np.ndarray, some: np.ndarray) -> np.ndarray:
-    """Some of the points, in their order."""
+def pick(values: np.ndarray, some: np.ndarray) -> np.ndarray:
+    """Take columns, in their order.
+
+    Parameters
+    ----------
+    values : (..., n) ndarray
+        Any.
+    some : (m,) int64
+        Which, ascending, each once; so n of them are all.
+
+    Returns
+    -------
+    (..., m) ndarray
+        Not a copy if it is all of them.
+    """
     return values if len(some) == values.shape[-1] else np.take(values, some, axis=-1)
 
 
 def _corners(cells: DualCells, place, base, share, number, touched: np.ndarray) -> tuple[np.ndarray, ...]:
     """(8, m) rows and linear weights of dual cells that have corners, and whether all of them exist."""
-    number = _part(number, touched)
+    number = pick(number, touched)
     row = np.ascontiguousarray(np.take(cells.corners, number, axis=0).T)
-    weight = _trilinear(_part(place - base, touched).astype(np.float32), _part(share, touched))
+    weight = _trilinear(pick(place - base, touched).astype(np.float32), pick(share, touched))
     return row, weight, cells.whole[number]
 
 
@@ -141,7 +154,7 @@ def _missing(corners: tuple[np.ndarray, ...], base: np.ndarray, size: float) -> 
     share = in_order(missing)
     on = np.flatnonzero(share > NOTHING)
     moved = np.stack([in_order(missing[CORNERS[:, axis] == 1]) for axis in range(3)])
-    return some[on], (_part(base, some[on]) + 0.5 + moved[:, on] / share[on]) * size, share[on]
+    return some[on], (pick(base, some[on]) + 0.5 + moved[:, on] / share[on]) * size, share[on]
 
 
 def _trilinear(place: np.ndarray, share: np.ndarray) -> np.ndarray:
@@ -153,4 +166,4 @@ def _trilinear(place: np.ndarray, share: np.ndarray) -> np.ndarray:
 
 def _place(points: np.ndarray, point: np.ndarray, base: np.ndarray, size: float) -> np.ndarray:
     """Points relative to the centres of the first corners [voxels]."""
-    return (_part(points, point) * (1.0 / size) - 0.5 - base).astype(np.float32)
+    return (pick(points, point) * (1.0 / size) - 0.5 - base).astype(np.float32)

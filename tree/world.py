@@ -26,8 +26,8 @@ __all__ = ["TRANSPORTS", "World", "load"]
 TRANSPORTS = ("all", "local", "sun", "sky")
 FIXED_SUN = np.radians(1.0)
 """How far from a baked direction a fixed sun may be asked for [rad]: two disks of the sun."""
-CHUNK = 1 << 14
-"""Points handled at a time: their temporaries stay in the cache of a core."""
+CHUNK = 1 << 15
+"""Points handled at a time: few enough for some 50 MB, so many that calls cost little."""
 REMEMBERED = 4
 """Combinations of transports, sun and sky whose coefficients are kept for the next look-up."""
 
