@@ -22,7 +22,7 @@ from .receivers import Receivers
 from .scene import Scene
 from .sight import Pairs, look
 
-LOSS = 0.4
+LOSS = 0.1
 """What a unit of visible weight counts against one of invisible weight: it can be made up for by other data points."""
 
 FAINT = ENOUGH / 10

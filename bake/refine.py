@@ -31,9 +31,6 @@ from .receivers import Receivers
 from .scene import Scene
 from .survey import Judge, State, confidence, squared_errors, trace
 
-FEW = 4
-"""A voxel with fewer receivers is judged with those around it: a corner of a closet is lit by the same data points."""
-
 FEWEST = 2
 """Receivers without which a voxel is not judged."""
 
@@ -187,12 +184,14 @@ class _Refinement:
 
     def wanting(self, level: int) -> np.ndarray:
         """What subdivision of each solid voxel of a level buys for each data point; 0 where it is good enough."""
-        coords, at, errors = self.outline.coords[level], self.state.seen.at, self.errors()
-        place = at.position / float(self.grid.voxel_size(level))
-        own = _pooled(coords, np.floor(place)[:, None], at.area, errors)
-        near = _pooled(coords, np.floor(place - 0.5)[:, None] + CORNERS, at.area, errors)
-        squared, noise, area, number = np.where(own[3] < FEW, near, own)
-        allowed = self.target.error**2 * area + SURE * noise * np.sqrt(2 / np.maximum(number, 1))
+        coords, at = self.outline.coords[level], self.state.seen.at
+        voxel = np.floor(at.position / float(self.grid.voxel_size(level))).astype(np.int64)
+        near = np.flatnonzero(Region.around(coords).contains(voxel))
+        row, inside = finder(coords)(voxel[near]), near[finder(coords)(voxel[near]) >= 0]
+        row, area, count = row[row >= 0], at.area[inside], len(coords)
+        squared, noise = (np.bincount(row, values[inside] * area, count) for values in self.errors())
+        number = np.maximum(np.bincount(row, minlength=count), 1)
+        allowed = self.target.error**2 * np.bincount(row, area, count) + SURE * noise * np.sqrt(2 / number)
         poor = (squared > allowed) & (number >= FEWEST)
         return np.where(poor, squared / np.maximum(self.outline.cost(level), 1), 0.0)
 
@@ -258,17 +257,6 @@ class _Refinement:
         show, stage, count = self.progress, self.stage, 3 * self.grid.levels
         self.stage += 1
         return None if show is None else lambda share: show((stage + share) / count)
-
-
-def _pooled(coords: np.ndarray, voxel: np.ndarray, area: np.ndarray, errors: tuple) -> np.ndarray:
-    """(4, voxels) squared error, noise and area, and the number of receivers, of (n, k, 3) voxels for each receiver."""
-    count = voxel.shape[1]
-    voxel = voxel.reshape(-1, 3).astype(np.int64)
-    near = np.flatnonzero(Region.around(coords).contains(voxel))
-    row = finder(coords)(voxel[near])
-    row, of = row[row >= 0], near[row >= 0] // count
-    sums = [np.bincount(row, value[of] * area[of], len(coords)) for value in (*errors, np.ones(len(area)))]
-    return np.stack([*sums, np.bincount(row, minlength=len(coords))])
 
 
 def _voxels_of(grid: Grid, tree: Topology, level: int) -> Callable[[np.ndarray], np.ndarray]:
