@@ -113,4 +113,6 @@ def _add(result: np.ndarray, values: np.ndarray, found: Iterable[Taps], some: np
             used = np.flatnonzero(counts)
             read = np.take(values, row.take(used), axis=0, mode="clip")
             read *= weight.take(used)[:, None]
-            result[point.take(used)] += read
+            to = point.take(used)
+            read += np.take(result, to, axis=0, mode="clip")
+            result[to] = read

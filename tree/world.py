@@ -129,10 +129,8 @@ class World:
         mean = blend(self._data, values, points, normals)
         total = np.zeros((len(points), 3), np.float32)
         for first in range(0, mean.shape[1], 27):
-            part = np.zeros((len(points), 3), np.float32)
-            for number in range(9):
-                part += functions[:, number, None] * mean[:, first + 3 * number : first + 3 * number + 3]
-            total += np.maximum(part, 0.0)
+            part = np.einsum("nh,nhc->nc", functions, mean[:, first : first + 27].reshape(-1, 9, 3))
+            total += np.maximum(part, 0.0, out=part)
         return np.minimum(total, np.finfo(np.float32).max)
 
     def _folded(self, factors: dict[str, np.ndarray]) -> np.ndarray:

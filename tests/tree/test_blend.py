@@ -218,6 +218,80 @@ def test_values_do_not_depend_on_the_order_or_number_of_points():
         np.testing.assert_array_equal(blend(data, values, points[part], normals[part]), whole[part])
 
 
+class Reader:
+    """Section 5 of docs/format.md, one point at a time, in double precision."""
+
+    def __init__(self, data, values):
+        self.data, self.values = data, values.astype(np.float64)
+        keys = np.column_stack([data.level, data.coords]).tolist()
+        self.rows = {tuple(key): row for row, key in enumerate(keys)}
+
+    def corners(self, q, level):
+        size = self.data.grid.voxel_size(level)
+        base = np.floor(q / size - 0.5)
+        t = q / size - 0.5 - base
+        for c in np.ndindex(2, 2, 2):
+            voxel = base + c
+            row = self.rows.get((level, *(int(number) for number in voxel)), -1)
+            yield row, np.where(c, t, 1 - t).prod(), (voxel + 0.5) * size
+
+    def stencil(self, p, level):
+        found, q, share = [], p, 1.0
+        for k in range(level, -1, -1):
+            corners = list(self.corners(q, k))
+            if all(row < 0 for row, _, _ in corners):
+                continue
+            found += [(row, share * w) for row, w, _ in corners if row >= 0]
+            lost = sum(w for row, w, _ in corners if row < 0)
+            if share * lost < 1e-9:
+                break
+            q = sum(w * center for row, w, center in corners if row < 0) / lost
+            share *= lost
+        return found
+
+    def weight(self, row, a, p, n):
+        if not self.data.valid[row]:
+            return 0.0
+        v = (self.data.position[row] - p) / self.data.size[row]
+        facing = min(max((n @ v + 0.001) / np.sqrt(v @ v + 0.000001), 0), 1) if n.any() else 1
+        for plane in self.data.plane[self.data.planes[row][self.data.planes[row] >= 0]]:
+            facing *= min(max(1 + (plane[:3] @ p - plane[3]) / plane[4], 0), 1)
+        return a * facing
+
+    def last(self, p):
+        data, total, weights = self.data, 0.0, 0.0
+        first = np.flatnonzero((data.level == 0) & data.valid)
+        for row, w, _ in self.corners(p, 0):
+            if row >= 0:
+                j = first[((data.coords[first] - data.coords[row]) ** 2).sum(axis=1).argmin()]
+                total, weights = total + w * data.shade[j] * self.values[j], weights + w
+        return total / weights
+
+    def value(self, p, n, level):
+        if level < 0:
+            return self.last(p)
+        found = [(row, self.weight(row, a, p, n)) for row, a in self.stencil(p, level)]
+        s, mean = sum(b for _, b in found), sum(b * self.values[row] for row, b in found)
+        rest = (0.02 - s) * self.value(p, n, level - 1) if s < 0.02 else 0
+        return (mean + rest) / max(s, 0.02)
+
+
+@pytest.mark.parametrize(("name", "dilation"), [("room", "partial"), ("five levels", "partial"), ("soup", "none")])
+def test_values_are_those_of_a_reader_written_from_the_format(name, dilation):
+    data = bakes.rough(name, dilation)
+    data = replace(data, shade=np.linspace(0.2, 1, len(data.valid)).astype(np.float32))
+    points, values = bakes.points(data, 400, seed=2), noise(data)
+    points = points[inside(data, points, 0 * points)]
+    normals = directions(len(points))
+    normals[::10] = 0
+    reader = Reader(data, values)
+    expected = [reader.value(p, n, data.grid.levels - 1)[0] for p, n in zip(points, normals, strict=True)]
+    found = blend(data, values, points, normals.astype(np.float32))[:, 0]
+    assert len(points) > 100
+    assert np.abs(found - expected).max() < SMOOTH
+    assert np.median(np.abs(found - expected)) < 1e-6
+
+
 def test_weights_say_how_far_the_finest_start_is_trusted():
     """Where they sum to ENOUGH or more, the value is their mean."""
     data = bakes.rough("soup")
