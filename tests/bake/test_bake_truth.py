@@ -78,7 +78,7 @@ def test_the_walls_of_a_baked_furnace_are_lit_by_the_analytic_value(tmp_path):
     points, normals = on_walls(500)
     found = []
     for seed in range(SEEDS):
-        job.bake(FURNACE, tmp_path / str(seed), Settings(samples=32, bounces=BOUNCES, seed=seed, finest=1))
+        job.bake(FURNACE, tmp_path / str(seed), Settings(samples=32, bounces=BOUNCES, seed=seed, finest=0.5))
         found.append(world.load(tmp_path / str(seed)).irradiance(points, normals)[:, 0])
     found = np.array(found, float)
     error = found.std(axis=0, ddof=1) / np.sqrt(SEEDS)
