@@ -22,11 +22,12 @@ CLOSE = 1e-9
 """Distance that jumps are bisected down to [m]."""
 SAMPLES = 33
 """Of a segment."""
-SMOOTH = 0.01
+SMOOTH = 2 * 2.0**-24 / interpolate.NEAR / module.ENOUGH
 """Largest jump over CLOSE that is no step, in units of the field's range.
 
 Places are float32, so near a data point, within `NEAR`, the cosine has grains of 2^-24 / NEAR = 6e-5, which the ramp of
-`ENOUGH` makes up to 50 times coarser: 0.003, the largest that is seen. The steepest value changes by 0.07 over 0.1 um.
+`ENOUGH` makes up to 1 / ENOUGH times coarser; half of SMOOTH is the largest that is seen. The value itself, however
+steep it is, changes by less than that over a nanometre.
 """
 
 
@@ -117,7 +118,7 @@ def test_the_value_has_no_step_inside_the_dense_grids(name, dilation):
     start, way, normals = short_segments(data, 1500)
     assert len(start) > 500
     coarse, close = along_segments(data, values, start, way, normals)
-    assert coarse.max() > 2 * SMOOTH or data.grid.levels == 1
+    assert coarse.max() > SMOOTH or data.grid.levels == 1
     assert close.max() < SMOOTH
 
 
@@ -145,12 +146,12 @@ def test_the_bisection_finds_a_planted_step(monkeypatch):
         found.weight[:] = np.where(found.weight > 0, found.weight + np.float32(0.05), 0)
 
     monkeypatch.setattr(interpolate, "_face", stepped)
-    assert along_segments(data, values, *segments)[1].max() > 10 * SMOOTH
+    assert along_segments(data, values, *segments)[1].max() > 4 * SMOOTH
     monkeypatch.undo()
     sharp = replace(data, plane=np.where(np.arange(5) == 4, 1e-12, data.plane))
-    assert along_segments(sharp, values, *segments)[1].max() > 10 * SMOOTH
+    assert along_segments(sharp, values, *segments)[1].max() > 4 * SMOOTH
     monkeypatch.setattr(module, "ENOUGH", 1e-30)
-    assert along_segments(data, values, *segments)[1].max() > 10 * SMOOTH
+    assert along_segments(data, values, *segments)[1].max() > 4 * SMOOTH
 
 
 def test_the_last_resort_has_no_step_inside_the_dense_grids():
@@ -272,8 +273,8 @@ class Reader:
             return self.last(p)
         found = [(row, self.weight(row, a, p, n)) for row, a in self.stencil(p, level)]
         s, mean = sum(b for _, b in found), sum(b * self.values[row] for row, b in found)
-        rest = (0.02 - s) * self.value(p, n, level - 1) if s < 0.02 else 0
-        return (mean + rest) / max(s, 0.02)
+        rest = (module.ENOUGH - s) * self.value(p, n, level - 1) if s < module.ENOUGH else 0
+        return (mean + rest) / max(s, module.ENOUGH)
 
 
 @pytest.mark.parametrize(("name", "dilation"), [("room", "partial"), ("five levels", "partial"), ("soup", "none")])
