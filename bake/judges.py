@@ -6,17 +6,19 @@ close before walls; and beyond the cell's border, where its data points light th
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 
 import numpy as np
 
 from ..tree.dualcells import CORNERS
 from ..tree.grid import BRANCH, Grid
-from ..tree.region import Region, finder
 from ..tree.topology import Topology
 from . import contacts, receivers
 from .receivers import Receivers
 from .scene import Scene
+
+AROUND = np.array(list(itertools.product((-1, 0, 1), repeat=3)), np.int64)
 
 DENSER = 0.5
 """Distance between judges, in that of receivers whose light is traced."""
@@ -52,7 +54,8 @@ def around(scene: Scene, grid: Grid, tree: Topology, threads: int = 0) -> Receiv
         of = coords[voxel_level == level]
         low, high = (of.min(axis=0) - 0.5) * size, (of.max(axis=0) + 1.5) * size
         spacing = DENSER * receivers.spacing(int(level), size)
-        at = receivers.spread(scene, low, high, spacing, _lit_by(grid, voxel_level, coords, int(level)), threads)
+        lit, near = _lit_by(grid, voxel_level, coords, int(level)), receivers.touching(_surrounded(of), size)
+        at = receivers.spread(scene, low, high, spacing, lit, threads, touches=near)
         parts += [at, contacts.find(scene, at, gap)]
     return receivers.join(parts)
 
@@ -61,7 +64,7 @@ def _lit_by(grid: Grid, level: np.ndarray, coords: np.ndarray, number: int) -> C
     """A function that says which positions have some voxel of a level around them, and not only finer ones."""
     some, _ = _dual_cells(coords[level == number])
     finer, count = _dual_cells(coords[level == number + 1])
-    has_some, has_all = _among(some), _among(finer[count == len(CORNERS)])
+    has_some, has_all = receivers.among(some), receivers.among(finer[count == len(CORNERS)])
     sizes = [float(grid.voxel_size(number)), float(grid.voxel_size(number)) / BRANCH]
 
     def lit(position: np.ndarray) -> np.ndarray:
@@ -71,16 +74,9 @@ def _lit_by(grid: Grid, level: np.ndarray, coords: np.ndarray, number: int) -> C
     return lit
 
 
-def _among(cells: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """A function that says which cells are among some."""
-    region, row = Region.around(cells), finder(cells)
-
-    def has(asked: np.ndarray) -> np.ndarray:
-        found = region.contains(asked)
-        found[found] = row(asked[found]) >= 0
-        return found
-
-    return has
+def _surrounded(coords: np.ndarray) -> np.ndarray:
+    """Some voxels and their 26 neighbours: what their dual cells reach into."""
+    return np.unique((coords[:, None] + AROUND).reshape(-1, 3), axis=0)
 
 
 def _dual_cells(coords: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..tree.dualcells import CORNERS
+from ..tree.region import Region, finder
 from . import warp
 from .datapoints import BACKFACE_LIMIT
 from .gather import TILE_LANES, run_tiles
@@ -29,6 +31,9 @@ FEELERS = 16
 
 CRACK = 1 / 32
 """A side is squeezed when most of its rays end within this distance [spacings]: nobody sees what light is there."""
+
+COARSER = 10
+"""Doublings of a voxel's size at which boxes are looked up; larger boxes count as touching."""
 
 PIECE = 128
 """Most points that one side of a piece holds: small against a tile, large against the rounding of their number."""
@@ -107,6 +112,7 @@ def spread(
     wanted: Callable[[np.ndarray], np.ndarray] | None = None,
     threads: int = 0,
     progress: Callable[[int], bool] | None = None,
+    touches: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
 ) -> Receivers:
     """Spread receivers over the surfaces in a box.
 
@@ -125,6 +131,8 @@ def spread(
         Worker threads; 0 uses every core.
     progress : callable, optional
         As in `gather.run_tiles`, counting pieces of triangles.
+    touches : callable, optional
+        Takes lowest and highest corners of boxes, and says which may hold a position that is wanted: `touching`.
 
     Returns
     -------
@@ -147,7 +155,7 @@ def spread(
     if not spacing > 0:
         raise ValueError(f"the spacing is {spacing} m; give a positive one")
     low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
-    pieces = _split(_triangles(scene.soup.corners, low, high, spacing), low, high, spacing)
+    pieces = _split(_triangles(scene.soup.corners, low, high, spacing), low, high, spacing, touches)
     found: dict[int, Receivers] = {}
 
     def work(rows: np.ndarray) -> int:
@@ -178,6 +186,59 @@ def spacing(level: int, size: float) -> float:
         About the side of the area that a receiver stands for [m].
     """
     return SPACING[min(level, len(SPACING) - 1)] * size
+
+
+def touching(coords: np.ndarray, size: float) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """Make a test whether boxes touch some voxels.
+
+    Parameters
+    ----------
+    coords : (n, 3) int64 ndarray
+        Voxels of one level.
+    size : float
+        Their size [m].
+
+    Returns
+    -------
+    callable
+        Takes (m, 3) float64 lowest and highest corners; (m,) bool, True for every box that touches a voxel and for
+        some that only come close: a box is looked up among voxels at least as large as itself.
+    """
+    levels = [(size * 2.0**step, among(coords >> step)) for step in range(COARSER)]
+
+    def touch(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        extent, found = (high - low).max(axis=1, initial=0.0), np.ones(len(low), bool)
+        for step, (width, has) in enumerate(levels):
+            rows = np.flatnonzero((extent <= width) & ((step == 0) | (extent > width / 2)))
+            base = np.floor(low[rows] / width).astype(np.int64)
+            found[rows] = has((base[:, None] + CORNERS).reshape(-1, 3)).reshape(-1, 8).any(axis=1)
+        return found
+
+    return touch
+
+
+def among(cells: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Make a test which voxels are among some.
+
+    Parameters
+    ----------
+    cells : (n, 3) int64 ndarray
+        Voxels, also more than once.
+
+    Returns
+    -------
+    callable
+        Takes (m, 3) int64 voxels; (m,) bool.
+    """
+    cells = np.unique(cells, axis=0)
+    region, row = Region.around(cells), finder(cells)
+
+    def has(asked: np.ndarray) -> np.ndarray:
+        found = region.contains(asked)
+        found[found] = row(asked[found]) >= 0
+        return found
+
+    return has
 
 
 def lifted(scene: Scene, receivers: Receivers) -> np.ndarray:
@@ -267,11 +328,14 @@ def _crosses(triangles: np.ndarray) -> np.ndarray:
     return np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
 
 
-def _split(pieces: _Pieces, low: np.ndarray, high: np.ndarray, spacing: float) -> _Pieces:
+def _split(pieces: _Pieces, low: np.ndarray, high: np.ndarray, spacing: float, touches) -> _Pieces:
     """Halve triangles across their longest edge until none holds too many points; drop what is outside the box."""
     done = []
     while len(pieces.key):
-        near = ((pieces.corners.min(axis=1) <= high) & (pieces.corners.max(axis=1) >= low)).all(axis=1)
+        lowest, highest = pieces.corners.min(axis=1), pieces.corners.max(axis=1)
+        near = ((lowest <= high) & (highest >= low)).all(axis=1)
+        if touches is not None:
+            near[near] = touches(lowest[near], highest[near])
         pieces = pieces[near]
         small = _areas(pieces.corners) <= PIECE * spacing**2
         done.append(pieces[small])

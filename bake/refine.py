@@ -164,7 +164,9 @@ class _Refinement:
         low = np.array(tree.grid_min) * self.grid.first_size
         high = low + np.array(tree.grid_shape) * self.grid.first_size
         spacing = receivers.spacing(level, size)
-        at = receivers.spread(self.scene, low, high, spacing, inside, effort.threads)
+        of_level, coords = tree.voxels()
+        near = receivers.touching(coords[of_level == level], size)
+        at = receivers.spread(self.scene, low, high, spacing, inside, effort.threads, touches=near)
         seen = trace(self.scene, at, dataclasses.replace(effort, samples=self.target.samples), self.show())
         if self.state.seen is not None:
             seen = self.state.seen.take(~inside(self.state.seen.at.position)).plus(seen)
