@@ -140,7 +140,7 @@ def test_both_sides_of_leaves_have_receivers():
 def test_glass_before_a_wall_squeezes_nothing():
     glass = Material("glass", Channel((1.0,) * 3), transmission=Channel((1.0,)))
     room = build_scenes.box((-2 * REACH,) * 3, (2 * REACH,) * 3, inward=True)
-    parts = [(room, GRAY), (build_scenes.plane(1), GRAY), (build_scenes.plane(1, 0.002), glass)]
+    parts = [(room, GRAY), (build_scenes.plane(1), GRAY), (build_scenes.plane(1, 0.0005), glass)]
     found = everywhere(prepare(build_scenes.snapshot(parts), Model()), 0.1)
     assert found.area.sum() == pytest.approx(12, rel=1e-5)  # all but the glass that faces the wall
 
