@@ -18,7 +18,7 @@ import numpy as np
 
 from ..tree import build, folder
 from ..tree.grid import FIRST_SIZE, Grid
-from ..tree.outline import Outline, outline
+from ..tree.outline import outline
 from ..tree.planes import of_cell
 from ..tree.topology import Topology
 from . import snapshot_file
@@ -39,7 +39,7 @@ FORMAT = "gi_volumes bake 2"
 LISTED = 12
 """Cells that a message names."""
 
-BUDGET_TRIES = 3
+BUDGET_TRIES = 4
 """Times that a cell is baked to find how many data points its bytes allow; the last one counts, whatever it takes."""
 
 BUDGET_MARGIN = 0.97
@@ -121,10 +121,9 @@ def bake(
     place = Place(target, snapshot, header)
     effort = Effort(settings.samples, settings.bounces, settings.seed, threads)
     goal = Target(settings.error, settings.max_points, settings.dilation, effort, settings.receiver_samples)
+    work = _Work(scene, grid, place, settings, _judge(snapshot, settings, scene), goal)
     try:
-        trees = _bake_cells(
-            _Work(scene, grid, place, settings, _judge(snapshot, settings, scene), goal), wanted, progress
-        )
+        trees = _bake_cells(work, wanted, progress)
         place.take()
     finally:
         listed = place.close()
@@ -134,6 +133,7 @@ def bake(
         outcome.warnings.append(
             f"first-level voxels of {grid.first_size:g} m suit this scene's size; --finest changes it"
         )
+    outcome.warnings += work.warnings
     if len(listed) < len(occupied):
         outcome.warnings.append(f"{len(occupied) - len(listed)} of the scene's {len(occupied)} cells are not baked yet")
     outcome.seconds = progress.seconds
@@ -182,6 +182,7 @@ class _Work:
     settings: Settings
     judge: Judge
     target: Target
+    warnings: list[str] = field(default_factory=list)
 
 
 def _judge(snapshot: Snapshot, settings: Settings, scene: Scene) -> Judge:
@@ -231,23 +232,23 @@ def _bake_cell(work: _Work, cell: tuple[int, int], show: Callable[[float], bool]
     """Grow the tree of one cell, measure and fit its light, write its files; again with fewer data points where it
     takes more bytes than it may."""
     found = outline(work.scene.soup.corners, work.grid, cell, by_light=work.target.error > 0)
-    _check_cap(found, work.target.max_points)
-    target, limit, known = work.target, work.settings.max_bytes, None
-    for last in (False,) * BUDGET_TRIES + (True,):
-        refined = refine(work.scene, found, work.judge, target, show, known)
+    target, limit = work.target, work.settings.max_bytes
+    for attempt in range(BUDGET_TRIES):
+        last = attempt == BUDGET_TRIES - 1
+        refined = refine(work.scene, found, work.judge, target, _part_of(show, attempt) if limit else show)
         size = _write(work, cell, refined, 0 if last else limit)
         if last or not limit or size <= limit:
-            return refined.tree
-        known, points = refined.measured, int(refined.tree.size * BUDGET_MARGIN * limit / size)
+            break
+        points = int(refined.tree.size * BUDGET_MARGIN * limit / size)
         target = dataclasses.replace(target, max_points=max(points, int(np.prod(found.dense.shape)) + 1))
+    if limit and size > limit:
+        work.warnings.append(f"cell {_list([cell])} takes {size:,} bytes, {size - limit:,} more than --max-bytes")
+    return refined.tree
 
 
-def _check_cap(found: Outline, max_points: int) -> None:
-    """Refuse a cap that not even the first level fits under."""
-    least = int(np.prod(found.dense.shape))
-    if max_points < least:
-        place = f"--max-points {max_points}: cell {found.cell[0]},{found.cell[1]}"
-        raise SettingsError(f"{place} has {least} first-level voxels; allow as many data points at least")
+def _part_of(show: Callable[[float], bool], attempt: int) -> Callable[[float], bool]:
+    """Progress of one of several attempts: each takes half of what is left."""
+    return lambda share: show(1 - (2 - share) / 2 ** (attempt + 1))
 
 
 def _write(work: _Work, cell: tuple[int, int], refined: State, limit: int) -> int:

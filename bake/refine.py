@@ -26,7 +26,7 @@ from ..tree.topology import Topology
 from . import judges, occluders, receivers
 from .datapoints import FARTHEST_STEP
 from .gather import Effort
-from .measured import Measured, measure, move
+from .measured import measure, move
 from .receivers import Receivers
 from .scene import Scene
 from .survey import Judge, State, confidence, squared_errors, trace
@@ -81,7 +81,6 @@ def refine(
     judge: Judge,
     target: Target,
     progress: Callable[[float], bool] | None = None,
-    known: Measured | None = None,
 ) -> State:
     """Grow the tree of a cell until its surfaces see what they should.
 
@@ -97,9 +96,6 @@ def refine(
         When to stop.
     progress : callable, optional
         Called with the part that is done, 0 to 1; returns False to stop.
-    known : Measured, optional
-        Data points that have been measured already, with the same effort.
-
     Returns
     -------
     State
@@ -114,15 +110,15 @@ def refine(
     -----
     Source: row 6 of the talk subdivides where there is geometry; by error as Unreal's and Activision's volumes do.
     """
-    return _Refinement(scene, outline, judge, target, progress, known).run()
+    return _Refinement(scene, outline, judge, target, progress).run()
 
 
 class _Refinement:
     """One cell on its way: what has been decided, by level, and what has been measured."""
 
-    def __init__(self, scene: Scene, outline: Outline, judge: Judge, target: Target, progress, known):
+    def __init__(self, scene: Scene, outline: Outline, judge: Judge, target: Target, progress):
         self.scene, self.outline, self.judge, self.target = scene, outline, judge, target
-        self.grid, self.progress, self.stage, self.known = outline.grid, progress, 0, known
+        self.grid, self.progress, self.stage = outline.grid, progress, 0
         self.need = [np.zeros(len(mask)) for mask in outline.wanted]
         for level in range(len(self.need) if target.error == 0 else min(1, len(self.need))):
             first = GEOMETRY * FINER**level * (1.0 + outline.need[level])
@@ -151,7 +147,7 @@ class _Refinement:
 
     def grow(self) -> None:
         """The tree of what is needed so far, measured."""
-        target, known = self.target, self.state.measured if self.state else self.known
+        target, known = self.target, self.state and self.state.measured
         tree = build.fit(self.outline, self.need, target.dilation, target.max_points, self.asked)
         measured = measure(self.scene, self.grid, tree, target.effort, known, self.show())
         data = interpolate.join(self.grid, [tree], measured.offset, measured.valid)
