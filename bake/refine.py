@@ -96,6 +96,7 @@ def refine(
         When to stop.
     progress : callable, optional
         Called with the part that is done, 0 to 1; returns False to stop.
+
     Returns
     -------
     State
