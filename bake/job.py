@@ -18,7 +18,7 @@ import numpy as np
 
 from ..tree import build, folder
 from ..tree.grid import FIRST_SIZE, Grid
-from ..tree.outline import outline
+from ..tree.outline import Outline, outline
 from ..tree.planes import of_cell
 from ..tree.topology import Topology
 from . import snapshot_file
@@ -232,6 +232,7 @@ def _bake_cell(work: _Work, cell: tuple[int, int], show: Callable[[float], bool]
     """Grow the tree of one cell, measure and fit its light, write its files; again with fewer data points where it
     takes more bytes than it may."""
     found = outline(work.scene.soup.corners, work.grid, cell, by_light=work.target.error > 0)
+    _check_cap(found, work.target.max_points)
     target, limit = work.target, work.settings.max_bytes
     for attempt in range(BUDGET_TRIES):
         last = attempt == BUDGET_TRIES - 1
@@ -244,6 +245,14 @@ def _bake_cell(work: _Work, cell: tuple[int, int], show: Callable[[float], bool]
     if limit and size > limit:
         work.warnings.append(f"cell {_list([cell])} takes {size:,} bytes, {size - limit:,} more than --max-bytes")
     return refined.tree
+
+
+def _check_cap(found: Outline, max_points: int) -> None:
+    """Refuse a cap that not even the first level fits under."""
+    least = int(np.prod(found.dense.shape))
+    if max_points < least:
+        place = f"--max-points {max_points}: cell {found.cell[0]},{found.cell[1]}"
+        raise SettingsError(f"{place} has {least} first-level voxels; allow as many data points at least")
 
 
 def _part_of(show: Callable[[float], bool], attempt: int) -> Callable[[float], bool]:
