@@ -6,19 +6,17 @@ close before walls; and beyond the cell's border, where its data points light th
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 
 import numpy as np
 
+from ..tree.dilate import neighbours
 from ..tree.dualcells import CORNERS
 from ..tree.grid import BRANCH, Grid
 from ..tree.topology import Topology
 from . import contacts, receivers
 from .receivers import Receivers
 from .scene import Scene
-
-AROUND = np.array(list(itertools.product((-1, 0, 1), repeat=3)), np.int64)
 
 DENSER = 0.5
 """Distance between judges, in that of receivers whose light is traced."""
@@ -54,7 +52,7 @@ def around(scene: Scene, grid: Grid, tree: Topology, threads: int = 0) -> Receiv
         of = coords[voxel_level == level]
         low, high = (of.min(axis=0) - 0.5) * size, (of.max(axis=0) + 1.5) * size
         spacing = DENSER * receivers.spacing(int(level), size)
-        lit, near = _lit_by(grid, voxel_level, coords, int(level)), receivers.touching(_surrounded(of), size)
+        lit, near = _lit_by(grid, voxel_level, coords, int(level)), receivers.touching(neighbours(of), size)
         at = receivers.spread(scene, low, high, spacing, lit, threads, touches=near)
         parts += [at, contacts.find(scene, at, gap)]
     return receivers.join(parts)
@@ -72,11 +70,6 @@ def _lit_by(grid: Grid, level: np.ndarray, coords: np.ndarray, number: int) -> C
         return has_some(coarse) & ~has_all(fine)
 
     return lit
-
-
-def _surrounded(coords: np.ndarray) -> np.ndarray:
-    """Some voxels and their 26 neighbours: what their dual cells reach into."""
-    return np.unique((coords[:, None] + AROUND).reshape(-1, 3), axis=0)
 
 
 def _dual_cells(coords: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

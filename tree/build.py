@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from . import bits
-from .dilate import BESIDE_FULL, DILATIONS, dilate, own
+from .dilate import DILATIONS, dilate, own
 from .first_level import occupied_cells
 from .grid import BRANCH, Grid
 from .need import FLAT
@@ -232,7 +232,7 @@ def _largest(outline: Outline, order: _Order, dilation: str, max_points: int) ->
 
 def _least(outline: Outline, order: _Order, dilation: str, room: int) -> tuple[str, list[np.ndarray]]:
     """The best dilation whose voxels fit, where nothing is subdivided and only other cells ask for some."""
-    for word in {"full": ("full", BESIDE_FULL), "partial": ("partial",)}.get(dilation, ()):
+    for word in {"full": ("full", "partial"), "partial": ("partial",)}.get(dilation, ()):
         found = _voxels(outline, order.divided(0), word)
         if _count(found) <= room:
             return word, found

@@ -15,16 +15,14 @@ import itertools
 
 import numpy as np
 
+from .dualcells import CORNERS
 from .grid import BRANCH, CELL_VOXELS
 from .outline import Outline
 from .region import Region
 
-__all__ = ["BESIDE_FULL", "DILATIONS", "dilate"]
+__all__ = ["DILATIONS", "dilate", "neighbours", "own"]
 
 DILATIONS = ("none", "partial", "full")
-BESIDE_FULL = "beside full"
-"""Partial dilation next to cells that may be dilated fully: for a cell whose own full dilation the cap forbids."""
-CORNERS = np.array(list(itertools.product((0, 1), repeat=3)), np.int64)
 STEPS = list(itertools.product((-1, 0, 1), repeat=3))
 
 
@@ -38,7 +36,7 @@ def dilate(outline: Outline, solid: list[np.ndarray], dilation: str) -> list[np.
     solid : list of (m, 3) int64
         For each level the solid voxels that the cell is to have; their parents are among them.
     dilation : str
-        "none", "partial", "full" or "beside full".
+        One of `DILATIONS`.
 
     Returns
     -------
@@ -49,10 +47,10 @@ def dilate(outline: Outline, solid: list[np.ndarray], dilation: str) -> list[np.
     voxels = [solid[0][:0], *solid[1:]]
     if dilation == "none" or not finest:
         return voxels
-    others = _others(outline, dilation)
+    others = _others(outline)
     if dilation == "full":
         inner = np.concatenate([_solid_only(outline, solid[finest]), outline.border[finest]])
-        voxels[finest] = own(outline, finest, np.concatenate([solid[finest], _neighbours(inner)]))
+        voxels[finest] = own(outline, finest, np.concatenate([solid[finest], neighbours(inner)]))
     for level in range(finest, 1, -1):
         asked = _asked(voxels[level], others[level])
         asked = np.concatenate([asked, voxels[level] // BRANCH, solid[level - 1]])
@@ -88,14 +86,32 @@ def own(outline: Outline, level: int, coords: np.ndarray) -> np.ndarray:
     return _once(coords[inside])
 
 
-def _others(outline: Outline, dilation: str) -> list[np.ndarray]:
+def neighbours(coords: np.ndarray) -> np.ndarray:
+    """Return voxels with their 26 neighbours.
+
+    Parameters
+    ----------
+    coords : (n, 3) int64
+        Voxels, also more than once.
+
+    Returns
+    -------
+    (m, 3) int64
+        Each voxel once.
+    """
+    bricks, near, _ = _near(coords[:0], coords)
+    row, x, y, z = np.nonzero(near)
+    return bricks[row] * BRANCH + np.stack([x, y, z], axis=-1)
+
+
+def _others(outline: Outline) -> list[np.ndarray]:
     """Voxels of each level that other cells may have near the border, dilation included.
 
     What they have depends on what they believe of this cell: all that geometry allows, not what it has. Voxels asked
     for by themselves lie next to solid ones.
     """
     finest = len(outline.border) - 1
-    possible = [coords if level == 0 else _neighbours(coords) for level, coords in enumerate(outline.border)]
+    possible = [coords if level == 0 else neighbours(coords) for level, coords in enumerate(outline.border)]
     for level in range(finest, 2, -1):
         asked = _asked(possible[level][:0], possible[level])
         possible[level - 1] = _once(np.concatenate([asked, possible[level] // BRANCH, possible[level - 1]]))
@@ -107,13 +123,6 @@ def _others(outline: Outline, dilation: str) -> list[np.ndarray]:
 def _once(coords: np.ndarray) -> np.ndarray:
     """Each voxel once, sorted."""
     return Region.around(coords).unique(coords)
-
-
-def _neighbours(coords: np.ndarray) -> np.ndarray:
-    """All voxels with their 26 neighbours."""
-    bricks, near, _ = _near(coords[:0], coords)
-    row, x, y, z = np.nonzero(near)
-    return bricks[row] * BRANCH + np.stack([x, y, z], axis=-1)
 
 
 def _asked(own: np.ndarray, other: np.ndarray) -> np.ndarray:
