@@ -191,12 +191,13 @@ def _judge(snapshot: Snapshot, settings: Settings, scene: Scene) -> Judge:
     strength = sun_strength(snapshot, suns) / (max(suns, 1) if has_free_sun(settings.sun) else 1)
     sky = scene.sky.harmonics() if scene.model.sky == "harmonics" else np.ones((scene.model.sky_count, 3))
     parts = [np.ones((int(scene.has_local), 3)), strength if suns else np.zeros((0, 3)), sky]
-    mean, ends = np.concatenate(parts), np.cumsum([len(part) for part in parts])
-    views = [
-        np.where((np.arange(len(mean)) < end) & (np.arange(len(mean)) >= end - len(part)), 1.0, 0.0)[:, None] * mean
-        for part, end in zip(parts, ends, strict=True)
-        if len(part)
-    ]
+    views = []
+    for number, part in enumerate(parts):
+        if len(part):
+            others = [np.zeros_like(other) for other in parts]
+            others[number] = part
+            views.append(np.concatenate(others))
+    mean = np.concatenate(parts)
     return Judge(np.array(views).reshape(len(views), len(mean), 3), mean)
 
 

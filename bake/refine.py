@@ -126,6 +126,7 @@ class _Refinement:
             self.need[level] = np.where(outline.need[level] > 0, first, 0.0)
         self.asked = [np.zeros((0, 3), np.int64)] * self.grid.levels
         self.state: State | None = None
+        self.judged: tuple | None = None
 
     def run(self) -> State:
         """Level by level, coarse to fine."""
@@ -178,16 +179,20 @@ class _Refinement:
         self.state = dataclasses.replace(self.state, data=data)
 
     def errors(self) -> tuple[np.ndarray, np.ndarray]:
-        """(n,) relative squared errors at the receivers, and (n,) what part of that may be noise."""
-        return squared_errors(self.state, self.judge, self.target.effort.threads)
+        """(n,) relative squared errors at the receivers, and (n,) what part of that may be noise; once for each state,
+        as they take a fit."""
+        if self.judged is None or self.judged[0] is not self.state:
+            self.judged = self.state, squared_errors(self.state, self.judge, self.target.effort.threads)
+        return self.judged[1]
 
     def wanting(self, level: int) -> np.ndarray:
         """What subdivision of each solid voxel of a level buys for each data point; 0 where it is good enough."""
         coords, at = self.outline.coords[level], self.state.seen.at
         voxel = np.floor(at.position / float(self.grid.voxel_size(level))).astype(np.int64)
         near = np.flatnonzero(Region.around(coords).contains(voxel))
-        row, inside = finder(coords)(voxel[near]), near[finder(coords)(voxel[near]) >= 0]
-        row, area, count = row[row >= 0], at.area[inside], len(coords)
+        row = finder(coords)(voxel[near])
+        inside, row = near[row >= 0], row[row >= 0]
+        area, count = at.area[inside], len(coords)
         squared, noise = (np.bincount(row, values[inside] * area, count) for values in self.errors())
         number = np.maximum(np.bincount(row, minlength=count), 1)
         allowed = self.target.error**2 * np.bincount(row, area, count) + SURE * noise * np.sqrt(2 / number)
