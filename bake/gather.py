@@ -14,11 +14,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from . import paths, warp
-from .paths import FAR, TARGET_SHORTENED, Numbers, Wave, unblocked
+from . import lit_spots, paths, warp
+from .paths import Numbers, Wave
 from .scene import Scene
 from .sensors import Sensor
 from .sobol import Sampler, scramble
+from .visibility import FAR, TARGET_SHORTENED, unblocked
 
 TILE_LANES = 65536
 """Paths in flight per thread: below, numpy's cost per call shows; above, they fall out of the cache."""
@@ -193,7 +194,7 @@ def _gather_block(scene: Scene, sensor: Sensor, position, rows, sampler: Sampler
     stacked /= pdf
     weights = sensor.response(rows[point], direction)
     total = _project(weights, stacked.reshape(-1, len(lanes)), len(rows), count)
-    for channel, toward, value in _direct(scene, sensor, start, rows[point], numbers, lanes):
+    for channel, toward, value in _direct(scene, sensor, start, rows[point], numbers, lanes, bounces):
         weights = sensor.response(rows[point], toward)
         total[:, :, 3 * channel : 3 * channel + 3] += _project(weights, value, len(rows), count)
     return total
@@ -210,7 +211,7 @@ def _project(weights: np.ndarray, values: np.ndarray, points: int, count: int) -
     return total
 
 
-def _direct(scene: Scene, sensor: Sensor, position, rows, numbers: Numbers, lanes):
+def _direct(scene: Scene, sensor: Sensor, position, rows, numbers: Numbers, lanes, bounces: int):
     """Direct light at the points themselves: (channel, directions, radiance over density) for each source.
 
     Emissive surfaces and an uneven sky are also found by chance; the balance heuristic shares them out.
@@ -226,10 +227,26 @@ def _direct(scene: Scene, sensor: Sensor, position, rows, numbers: Numbers, lane
         direction = _unit(toward)
         value = radiance / (density + sensor.pdf(rows, direction))
         yield 0, direction, _visible(scene, value, position, toward, TARGET_SHORTENED, density > 0)
+    if scene.model.local and scene.lit_spots.count and bounces:
+        u = numbers.draw(lanes, DIRECT_DIMENSIONS + 10, lit_spots.NUMBERS)
+        ends = paths.passing(numbers, lanes, 0)
+        some, toward, radiance, density = scene.lit_spots.sample(position, u, ends)
+        direction = _unit(toward)
+        value = radiance / (density + sensor.pdf(rows[some], direction))
+        seen, tint = unblocked(scene, position[:, some], toward, TARGET_SHORTENED, density > 0)
+        yield 0, *_scattered(position.shape, some[seen], direction[:, seen], value[:, seen] * tint)
     if scene.model.sky == "fixed" and scene.sky.uneven:
         direction, radiance, density = scene.sky.sample(numbers.draw(lanes, DIRECT_DIMENSIONS + 7, 3))
         value = radiance / (density + sensor.pdf(rows, direction))
         yield functions_start, direction, _visible(scene, value, position, direction, FAR, density > 0)
+
+
+def _scattered(shape: tuple[int, int], rows: np.ndarray, *parts: np.ndarray) -> list[np.ndarray]:
+    """Columns at their rows, among zeros."""
+    out = [np.zeros(shape, np.float32) for _ in parts]
+    for target, part in zip(out, parts, strict=True):
+        target[:, rows] = part
+    return out
 
 
 def _visible(scene: Scene, value: np.ndarray, position, toward, far, useful, shadow=None) -> np.ndarray:

@@ -36,12 +36,16 @@ class LampSample:
     irradiance : (3, n) float32 [W/m2] on a surface that faces it, over the sample's probability; 0 for none
     shadow : (n,) bool, whether the way has to be free
     lit : (n,) bool, whether there is any light
+    lamp : (n,) int64, which lamp
+    source : (3, n) float32 [m], from the surface to where `Lamps.emit` starts the lamp's rays
     """
 
     toward: np.ndarray
     irradiance: np.ndarray
     shadow: np.ndarray
     lit: np.ndarray
+    lamp: np.ndarray
+    source: np.ndarray
 
 
 class Lamps:
@@ -71,7 +75,7 @@ class Lamps:
         self._spot = np.ascontiguousarray(lights.spot[rows].T)
         self._shadow = lights.shadow[rows]
         self._luminance = luminance(self._strength)
-        power = _power(self._kind, self._strength, self._size, self._spot)
+        self._power = power = _power(self._kind, self._strength, self._size, self._spot)
         total = power.sum()
         self._pmf = (power / total if total > 0 else np.full(self.count, 1 / max(self.count, 1))).astype(np.float32)
         self._cdf = np.cumsum(self._pmf, dtype=np.float64)
@@ -107,7 +111,100 @@ class Lamps:
         if candidates is not None:
             weight = weight * (CANDIDATES * self._pmf[lamp])
         falloff = falloff * np.divide(total, weight, out=np.zeros_like(total), where=weight > 0)
-        return LampSample(toward, self._strength[:, lamp] * falloff, self._shadow[lamp] & (falloff > 0), falloff > 0)
+        irradiance, lit = self._strength[:, lamp] * falloff, falloff > 0
+        source = np.where(self._kind[lamp] <= LightKind.SPOT, self._position[:, lamp] - position, toward)
+        return LampSample(toward, irradiance, self._shadow[lamp] & lit, lit, lamp, source)
+
+    def shine(self, lamp: np.ndarray, position: np.ndarray, u: tuple[np.ndarray, ...]):
+        """Light of given lamps.
+
+        Parameters
+        ----------
+        lamp : (n,) int64 ndarray
+            The lamp of each lane.
+        position : (3, n) float32 ndarray
+            Points [m].
+        u : two (n,) float32 ndarrays
+            Uniform numbers: where on the lamp.
+
+        Returns
+        -------
+        toward : (3, n) float32 ndarray
+            From the point to the lamp [m]; not of unit length.
+        irradiance : (3, n) float32 ndarray
+            On a surface that faces it, without shadows [W/m2].
+        """
+        toward, falloff = self._evaluate(lamp, position, *u)
+        return toward, self._strength[:, lamp] * falloff
+
+    def emit(self, lamp: np.ndarray, u: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray]:
+        """Rays that leave lamps: round ones at their centre, into their cone; area lamps anywhere, by the cosine.
+
+        Parameters
+        ----------
+        lamp : (n,) int64 ndarray
+            The lamp of each ray.
+        u : four (n,) float32 ndarrays
+            Uniform numbers: where on the lamp, as for `sample`, and the direction.
+
+        Returns
+        -------
+        start, direction : (3, n) float32 ndarray
+            Points [m], unit vectors; their density is `pdf_solid_angle`.
+        """
+        u1, u2, u3, u4 = u
+        z, cone = self._z[:, lamp], np.maximum(self._spot[0, lamp], -1)
+        x, y = warp.frame(z)
+        cosine = 1 - u3 * (1 - cone)
+        sine = np.sqrt(np.maximum(1 - cosine * cosine, 0))
+        angle = warp.TAU * u4
+        into_cone = z * cosine + (x * np.cos(angle) + y * np.sin(angle)) * sine
+        start = self._position[:, lamp]
+        is_area = self._kind[lamp] > LightKind.SPOT
+        if not is_area.any():
+            return start, -into_cone
+        place = self._evaluate_area(lamp, start, u1, u2)[0]
+        return np.where(is_area, place, start), -np.where(is_area, warp.cosine(u3, u4, z), into_cone)
+
+    def pdf_solid_angle(self, lamp: np.ndarray, toward: np.ndarray) -> np.ndarray:
+        """Density of the directions of `emit`.
+
+        Parameters
+        ----------
+        lamp : (n,) int64 ndarray
+            Lamps.
+        toward : (3, n) float32 ndarray
+            Unit vectors against the direction of light, from what is lit to the start of the ray.
+
+        Returns
+        -------
+        (n,) float32 ndarray
+            [1/sr].
+        """
+        cosine, cone = warp.dot(toward, self._z[:, lamp]), np.maximum(self._spot[0, lamp], -1)
+        within = np.where(cosine >= cone, 1 / (warp.TAU * np.maximum(1 - cone, np.float32(1e-6))), np.float32(0))
+        is_area = self._kind[lamp] > LightKind.SPOT
+        return np.where(is_area, np.maximum(cosine, 0) * np.float32(1 / np.pi), within)
+
+    @property
+    def power(self) -> np.ndarray:
+        """(k,) emitted luminance of each lamp [W]."""
+        return self._power
+
+    @property
+    def shadow(self) -> np.ndarray:
+        """(k,) bool, whether things block each lamp."""
+        return self._shadow
+
+    @property
+    def is_round(self) -> np.ndarray:
+        """(k,) bool, points and spots."""
+        return self._kind <= LightKind.SPOT
+
+    @property
+    def radius(self) -> np.ndarray:
+        """(k,) float32 radius of round lamps, 0 for area lamps [m]."""
+        return np.where(self.is_round, self._size[0], np.float32(0))
 
     def _weigh(self, position, normal, draw, u1, u2) -> tuple[np.ndarray | None, np.ndarray]:
         """(lamp of each candidate, or None when the candidates are all lamps; their weights), (candidates, n)."""

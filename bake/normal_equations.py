@@ -19,6 +19,9 @@ __all__ = ["Operator", "Solver"]
 SUMMED = 16
 """Taps of a data point in one matrix product; larger ones start threads of BLAS, which change the last bits."""
 
+SWEPT = 512
+"""Matrices that are inverted at a time: they stay in the cache."""
+
 ITERATIONS = 50
 TOLERANCE = 1e-2
 """Relative residual, in the preconditioner's norm, at which a column is solved; 1e-5 changes errors by under 0.1 %."""
@@ -136,7 +139,7 @@ class Solver:
         self._operator = operator
         penalty = prior[:, None] * (harmonics.COSINE[0] / harmonics.COSINE) ** 2
         blocks = operator.blocks().astype(np.float64) + penalty[:, :, None] * np.eye(harmonics.COUNT)
-        self.inverse = np.linalg.inv(blocks).astype(np.float32)
+        self.inverse = _inverse(blocks).astype(np.float32)
         self._penalty = penalty[:, :, None].astype(np.float32)
 
     def solve(self, traced: np.ndarray, seen: np.ndarray) -> np.ndarray:
@@ -183,6 +186,24 @@ class Solver:
         """The matrix of the normal equations."""
         seen = self._operator.apply(values) * self._operator.weight
         return self._operator.transpose(seen) + self._penalty * values
+
+
+def _inverse(blocks: np.ndarray) -> np.ndarray:
+    """Inverses of symmetric positive matrices, by sweeping one pivot after the other through all of them.
+
+    LAPACK takes 1.7 us for one of 9 x 9 on one thread, but 40 to 180 us where OpenBLAS wakes its threads for it.
+    Source: Goodnight 1979, "A Tutorial on the SWEEP Operator".
+    """
+    out = np.empty_like(blocks)
+    for first in range(0, len(blocks), SWEPT):
+        part = np.ascontiguousarray(np.moveaxis(blocks[first : first + SWEPT], 0, 2))
+        for pivot in range(len(part)):
+            row, scale = part[pivot].copy(), 1 / part[pivot, pivot]
+            part -= row[:, None] * (row * scale)
+            part[pivot] = part[:, pivot] = row * scale
+            part[pivot, pivot] = -scale
+        out[first : first + SWEPT] = -np.moveaxis(part, 2, 0)
+    return out
 
 
 def _places(point: np.ndarray, points: int) -> tuple[np.ndarray, np.ndarray]:

@@ -6,40 +6,30 @@ local light, for every sun key and for every function of the sky. Unbiased but f
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..tree import harmonics
-from . import warp
-from .rays import MISS, SKIP, Hits
+from . import lit_spots, warp
+from .rays import MISS, Hits
 from .scene import Scene
 from .sobol import Sampler
+from .visibility import FAR, TARGET_SHORTENED, meet, unblocked
 
 ROULETTE_START = 3
 """Bounces before Russian roulette may end a path: earlier ends cost more noise than they save time."""
 
-PASS_LIMIT = 32
-"""Transparent surfaces that one ray may cross; the next one is taken as opaque."""
-
-MET_WHERE_EMISSIVE = np.float32(0.5)
-"""Paths stop at an emissive surface at least this often, times its coverage: clear glass may shine."""
-
-TARGET_SHORTENED = np.float32(0.9999)
-"""Shadow rays stop short of the surface they aim at by this share."""
-
 GRAZING = np.float32(1e-6)
 """Least cosine of a density, so that no weight divides zero by zero."""
-
-FAR = np.float32(1e30)
-"""Length of a ray to the sun or the sky, in lengths of its direction."""
 
 # Dimensions of the random numbers. The first two choose the path's first direction.
 FIRST_VERTEX = 2
 SCATTER, LAMP, EMITTER, SKY, PER_VERTEX = 0, 2, 6, 9, 12
 HASHED = 1 << 16
 """Dimensions from here on are hashed, not Sobol points: roulette, transparency, the sun's disk."""
-ROULETTE, SUN_DISK, PASS, HASHED_PER_VERTEX = 0, 1, 3, 64
+ROULETTE, SUN_DISK, PASS, SPOT, HASHED_PER_VERTEX = 0, 1, 3, 40, 64
 
 
 @dataclass
@@ -175,7 +165,9 @@ def trace(scene: Scene, wave: Wave, numbers: Numbers, bounces: int) -> Radiance:
         if bounce == bounces:
             break
         vertex = _arrive(scene, wave, hits, travelled)
-        _add_lamps(scene, wave, vertex, numbers, bounce, light)
+        _add_lamps(scene, wave, vertex, numbers, bounce, travelled, light)
+        if bounce + 1 < bounces:
+            _add_lit_spots(scene, wave, vertex, numbers, bounce, light)
         _add_emitters(scene, wave, vertex, numbers, bounce, light)
         _add_suns(scene, wave, vertex, numbers, bounce, light)
         _add_sky(scene, wave, vertex, numbers, bounce, light)
@@ -185,8 +177,9 @@ def trace(scene: Scene, wave: Wave, numbers: Numbers, bounces: int) -> Radiance:
 
 @dataclass
 class Vertex:
-    """Where paths meet surfaces: points [m] off the surface, facing unit normals, reflectance; by component."""
+    """Where paths meet surfaces: triangles, points [m] off them, facing unit normals, reflectance; by component."""
 
+    triangle: np.ndarray
     position: np.ndarray
     normal: np.ndarray
     reflectance: np.ndarray
@@ -194,47 +187,34 @@ class Vertex:
 
 def _advance(scene: Scene, wave: Wave, numbers: Numbers, bounce: int, light: Radiance):
     """Trace to the next opaque hit; paths that leave collect the sky. Returns (paths, hits, metres travelled)."""
-    travelled = np.zeros(len(wave.lane), np.float32)
-    hits = scene.tracer.intersect(wave.origin, wave.direction)
-    if scene.tracer.has_transparent:
-        hits, travelled = _pass_through(scene, wave, hits, numbers, bounce)
+    hits, travelled = meet(scene, wave.origin, wave.direction, wave.beta, passing(numbers, wave.lane, bounce))
     alive = hits.triangle != MISS
     if not alive.all():
         _add_escaped(scene, wave.take(np.flatnonzero(~alive)), light)
         rows = np.flatnonzero(alive)
-        wave, hits, travelled = wave.take(rows), _take_hits(hits, rows), travelled[rows]
-    return wave, hits, travelled + hits.distance
+        wave, hits, travelled = wave.take(rows), hits.take(rows), travelled[rows]
+    return wave, hits, travelled
 
 
-def _pass_through(scene: Scene, wave: Wave, hits: Hits, numbers: Numbers, bounce: int):
-    """Let paths through transparent surfaces by chance. Returns (hits, metres before the last leg)."""
-    travelled = np.zeros(len(wave.lane), np.float32)
-    active = _transparent_rows(scene, hits, np.arange(len(wave.lane)))
-    for step in range(PASS_LIMIT):
-        if not len(active):
-            break
-        triangle, u, v = hits.triangle[active], hits.u[active], hits.v[active]
-        passed, covered = scene.surfaces.through(triangle, u, v)
-        chance = np.minimum(passed.mean(axis=0), 1 - MET_WHERE_EMISSIVE * covered * scene.surfaces.emissive[triangle])
-        dimension = HASHED + bounce * HASHED_PER_VERTEX + PASS + step
-        passes = numbers.draw(wave.lane[active], dimension, 1)[0] < chance
-        stays = active[~passes]
-        wave.beta[:, stays] *= (covered / np.maximum(1 - chance, np.float32(1e-6)))[~passes]
-        goes = active[passes]
-        wave.beta[:, goes] *= (passed / np.maximum(chance, np.float32(1e-6)))[:, passes]
-        travelled[goes] += _step_past(scene, wave, hits, goes)
-        _put_hits(hits, goes, scene.tracer.intersect(wave.origin[:, goes], wave.direction[:, goes]))
-        active = _transparent_rows(scene, hits, goes)
-    return hits, travelled
+def passing(numbers: Numbers, lane: np.ndarray, bounce: int) -> Callable[[np.ndarray, int], np.ndarray]:
+    """Choose the numbers that decide where rays end.
 
+    Parameters
+    ----------
+    numbers : Numbers
+        Where they come from.
+    lane : (n,) int64 ndarray
+        The rays.
+    bounce : int
+        How many vertices came before.
 
-def _step_past(scene: Scene, wave: Wave, hits: Hits, rows: np.ndarray) -> np.ndarray:
-    """Move origins beyond the surfaces they hit; returns the metres moved."""
-    distance = hits.distance[rows]
-    position = wave.origin[:, rows] + wave.direction[:, rows] * distance
-    step = distance + scene.tracer.offset(position, distance)
-    wave.origin[:, rows] += wave.direction[:, rows] * step
-    return step
+    Returns
+    -------
+    callable
+        As `visibility.meet` takes it.
+    """
+    first = HASHED + bounce * HASHED_PER_VERTEX + PASS
+    return lambda rows, step: numbers.draw(lane[rows], first + step, 1)[0]
 
 
 def _add_escaped(scene: Scene, wave: Wave, light: Radiance) -> None:
@@ -272,11 +252,11 @@ def _arrive(scene: Scene, wave: Wave, hits: Hits, travelled: np.ndarray) -> Vert
     position = wave.origin + wave.direction * hits.distance
     position += normal * scene.tracer.offset(position, travelled)
     reflectance = scene.surfaces.reflectance(hits.triangle, hits.u, hits.v)
-    return Vertex(position, normal, reflectance)
+    return Vertex(hits.triangle, position, normal, reflectance)
 
 
-def _add_lamps(scene: Scene, wave: Wave, vertex: Vertex, numbers: Numbers, bounce: int, light: Radiance) -> None:
-    """One shadow ray to one lamp."""
+def _add_lamps(scene: Scene, wave, vertex: Vertex, numbers: Numbers, bounce: int, travelled, light: Radiance) -> None:
+    """One shadow ray to one lamp, weighed against coming from the lamp where it lights a spot."""
     if not scene.model.local or not scene.lamps.count:
         return
     u = numbers.draw(wave.lane, FIRST_VERTEX + bounce * PER_VERTEX + LAMP, 4)
@@ -285,7 +265,29 @@ def _add_lamps(scene: Scene, wave: Wave, vertex: Vertex, numbers: Numbers, bounc
     cosine = np.maximum(warp.dot(sample.toward, vertex.normal), 0) / np.maximum(length, np.float32(1e-30))
     useful = sample.lit & (cosine > 0)
     rows, tint = unblocked(scene, vertex.position, sample.toward, TARGET_SHORTENED, useful, sample.shadow)
-    _collect(light.local, wave, vertex, rows, sample.irradiance[:, rows] * cosine[rows] * tint)
+    weight = cosine[rows]
+    if scene.lit_spots.count:
+        way = wave.direction[:, rows] * travelled[rows]
+        at = (sample.source[:, rows], vertex.position[:, rows], vertex.normal[:, rows])
+        other = scene.lit_spots.pdf_solid_angle(sample.lamp[rows], *at, way)
+        other[scene.surfaces.transparent[vertex.triangle[rows]] & scene.lit_spots.is_soft[sample.lamp[rows]]] = 0
+        weight = weight * (wave.pdf[rows] / (wave.pdf[rows] + other))
+    _collect(light.local, wave, vertex, rows, sample.irradiance[:, rows] * weight * tint)
+
+
+def _add_lit_spots(scene: Scene, wave: Wave, vertex: Vertex, numbers: Numbers, bounce: int, light: Radiance) -> None:
+    """One shadow ray from some paths to what a lamp's ray meets, weighed against finding it by chance."""
+    if not scene.model.local or not scene.lit_spots.count:
+        return
+    u = numbers.draw(wave.lane, HASHED + bounce * HASHED_PER_VERTEX + SPOT, lit_spots.NUMBERS)
+    ends = passing(numbers, wave.lane, bounce + 1)
+    some, toward, radiance, density = scene.lit_spots.sample(vertex.position, u, ends)
+    position, normal = vertex.position[:, some], vertex.normal[:, some]
+    length = np.sqrt(warp.dot(toward, toward))
+    cosine = np.maximum(warp.dot(toward, normal), 0) / np.maximum(length, np.float32(1e-30))
+    value = radiance * (cosine / (density + cosine * np.float32(1 / np.pi)))
+    rows, tint = unblocked(scene, position, toward, TARGET_SHORTENED, cosine > 0)
+    _collect(light.local, wave, vertex, some[rows], value[:, rows] * tint)
 
 
 def _add_emitters(scene: Scene, wave: Wave, vertex: Vertex, numbers: Numbers, bounce: int, light: Radiance) -> None:
@@ -377,81 +379,3 @@ def sun_direction(toward: np.ndarray, diameter: float, u: tuple[np.ndarray, ...]
     tangent, bitangent = warp.frame(toward[:, None])
     direction = center + radius * (tangent * x + bitangent * y)
     return direction / np.sqrt(warp.dot(direction, direction))
-
-
-def unblocked(
-    scene: Scene,
-    position: np.ndarray,
-    toward: np.ndarray,
-    far: np.float32,
-    useful: np.ndarray,
-    shadow: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Which lanes see what they look at, and what transparent surfaces leave of it.
-
-    Parameters
-    ----------
-    scene : Scene
-        What may be in the way.
-    position, toward : (3, n) float32 ndarray
-        Start [m], and the way to the target.
-    far : float32
-        Where to stop, in lengths of `toward`.
-    useful : (n,) bool ndarray
-        Lanes worth a ray.
-    shadow : (n,) bool ndarray, optional
-        Lanes that anything can block; the others always see their target.
-
-    Returns
-    -------
-    rows : (m,) int64 ndarray
-        Lanes that are useful and see their target.
-    tint : (3, m) or (1, 1) float32 ndarray
-        Light that is left; all of it when the scene has nothing transparent.
-    """
-    traced = useful if shadow is None else useful & shadow
-    limit = np.where(traced, far, SKIP)
-    blocked = scene.tracer.blocked(position, np.ascontiguousarray(toward), limit)
-    rows = np.flatnonzero(useful & ~blocked)
-    if not scene.tracer.has_transparent:
-        return rows, np.ones((1, 1), np.float32)
-    return rows, _transmittance(scene, position[:, rows], toward[:, rows], limit[rows])
-
-
-def _transmittance(scene: Scene, position: np.ndarray, toward: np.ndarray, limit: np.ndarray) -> np.ndarray:
-    """(3, n) light that transparent surfaces leave on each segment."""
-    tint = np.ones_like(position)
-    length = np.sqrt(warp.dot(toward, toward))
-    start, left = position.copy(), limit.copy()
-    active = np.flatnonzero(limit > 0)
-    for _ in range(PASS_LIMIT):
-        if not len(active):
-            break
-        hits = scene.tracer.intersect_transparent(start[:, active], toward[:, active], left[active])
-        met = np.flatnonzero(hits.triangle != MISS)
-        active, hits = active[met], _take_hits(hits, met)
-        tint[:, active] *= scene.surfaces.through(hits.triangle, hits.u, hits.v)[0]
-        here = start[:, active] + toward[:, active] * hits.distance
-        step = hits.distance + scene.tracer.offset(here, hits.distance * length[active]) / length[active]
-        start[:, active] += toward[:, active] * step
-        left[active] -= step
-        active = active[(left[active] > 0) & (warp.largest(tint[:, active]) > 0)]
-    tint[:, active] = 0
-    return tint
-
-
-def _transparent_rows(scene: Scene, hits: Hits, rows: np.ndarray) -> np.ndarray:
-    """Those of `rows` that hit something transparent."""
-    triangle = hits.triangle[rows]
-    return rows[(triangle != MISS) & scene.surfaces.transparent[triangle]]
-
-
-def _take_hits(hits: Hits, rows: np.ndarray) -> Hits:
-    return Hits(hits.triangle[rows], hits.distance[rows], hits.u[rows], hits.v[rows], hits.normal[:, rows])
-
-
-def _put_hits(hits: Hits, rows: np.ndarray, new: Hits) -> None:
-    """Overwrite some hits in place."""
-    for name in ("triangle", "distance", "u", "v"):
-        getattr(hits, name)[rows] = getattr(new, name)
-    hits.normal[:, rows] = new.normal

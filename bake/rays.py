@@ -45,6 +45,22 @@ class Hits:
     v: np.ndarray
     normal: np.ndarray
 
+    def take(self, rows: np.ndarray) -> Hits:
+        """Some of the rays.
+
+        Parameters
+        ----------
+        rows : (m,) int64 ndarray
+            Which.
+
+        Returns
+        -------
+        Hits
+            Copies.
+        """
+        parts = (getattr(self, name)[rows] for name in ("triangle", "distance", "u", "v"))
+        return Hits(*parts, self.normal[:, rows])
+
 
 class Tracer:
     """Rays against a fixed set of triangles; safe to call from several threads.

@@ -11,6 +11,7 @@ import numpy as np
 
 from .emitters import Emitters
 from .lamps import Lamps
+from .lit_spots import LitSpots
 from .rays import Tracer
 from .sky import Sky
 from .snapshot import LightKind, Snapshot, SnapshotError
@@ -57,6 +58,7 @@ class Scene:
     surfaces: Surfaces
     lamps: Lamps
     reflectors: Lamps
+    lit_spots: LitSpots
     emitters: Emitters
     sky: Sky
     model: Model
@@ -95,12 +97,16 @@ def prepare(snapshot: Snapshot, model: Model) -> Scene:
     lamp_rows = np.flatnonzero((snapshot.lights.kind != LightKind.SUN) & (snapshot.lights.strength > 0).any(axis=1))
     reflector_rows = lamp_rows[snapshot.lights.reflector[lamp_rows]]
     tracer = Tracer(soup.corners, surfaces.transparent)
+    lamps = Lamps(snapshot.lights, lamp_rows, snapshot.origin, tracer.size)
+    lit_spots = LitSpots(lamps, tracer, surfaces)
+    tracer.rays, tracer.seconds = 0, 0.0  # looking around from the lamps is no transport
     return Scene(
         soup=soup,
         tracer=tracer,
         surfaces=surfaces,
-        lamps=Lamps(snapshot.lights, lamp_rows, snapshot.origin, tracer.size),
+        lamps=lamps,
         reflectors=Lamps(snapshot.lights, reflector_rows, snapshot.origin, tracer.size),
+        lit_spots=lit_spots,
         emitters=Emitters(soup, surfaces),
         sky=Sky(snapshot.sky),
         model=model,
