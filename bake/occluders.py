@@ -148,6 +148,7 @@ class _Task:
         self.pairs, self.data, self.place = pairs, data, receivers.position
         self.weight, self.visible = pairs.weight.astype(np.float64), pairs.visible
         self.lit = np.bincount(pairs.receiver, self.weight * self.visible, len(self.place))
+        self.own = _within(data.boxes, self.place)
         self.value = self._values(receivers.area.astype(np.float64))
         finest = float(data.grid.voxel_size(data.grid.levels - 1))
         self.candidates = blockers.find(scene, pairs, np.abs(self.value), data.position, finest)
@@ -205,12 +206,15 @@ class _Task:
         return out
 
     def _best_of_lost(self, slots: _Slots) -> np.ndarray:
-        """For each receiver whose visible data points are all but hidden, the pair that would bring back the most."""
+        """For each receiver whose visible data points are all but hidden, the pair that would bring back the most.
+
+        Receivers in other cells have data points there that are not known here.
+        """
         rows = np.flatnonzero(self.visible & (slots.code >= 0).any(axis=1)[self.pairs.point])
         hidden = np.zeros(len(self.weight))
         hidden[rows] = self.weight[rows] * (1 - self.factors(slots, rows).prod(axis=1))
         left = self.lit - np.bincount(self.pairs.receiver, hidden, len(self.place))
-        lost = (left < np.minimum(self.lit / 2, ENOUGH)) & (self.lit > FAINT)
+        lost = (left < np.minimum(self.lit / 2, ENOUGH)) & (self.lit > FAINT) & self.own
         rows = rows[lost[self.pairs.receiver[rows]] & (hidden[rows] > 0)]
         order = rows[np.lexsort((rows, -hidden[rows], self.pairs.receiver[rows]))]
         return order[np.unique(self.pairs.receiver[order], return_index=True)[1]]
@@ -240,3 +244,9 @@ def _falloff(finest: float, cell: float) -> Falloff:
     steps = np.arange(1 + max(0, int(np.log2(WIDEST * finest / (NARROWEST * cell)) // 2)))
     width = WIDEST * finest * 4.0**-steps
     return Falloff(width, np.minimum(width / 2, DEEPEST * finest))
+
+
+def _within(boxes: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """(n,) whether points lie in the dense grid of any cell, or above or below it."""
+    inside = (place[:, None, :2] >= boxes[:, 0, :2]) & (place[:, None, :2] < boxes[:, 1, :2])
+    return inside.all(axis=2).any(axis=1)
