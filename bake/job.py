@@ -22,6 +22,7 @@ from ..tree.outline import Outline, outline
 from ..tree.planes import of_cell
 from ..tree.topology import Topology
 from . import snapshot_file
+from .fills import fills
 from .gather import CancelledError, Effort
 from .measured import split
 from .place import Place, check_target
@@ -31,9 +32,9 @@ from .refine import Target, refine
 from .scene import Model, Scene, prepare, scene_suns
 from .settings import LEVELS, Settings, SettingsError, check_scene, check_triangles, choose_grid, has_free_sun, model
 from .snapshot import Snapshot
-from .survey import Judge, State, fitted, shade
+from .survey import Judge, State, fitted, shade, shaded
 
-FORMAT = "gi_volumes bake 2"
+FORMAT = "gi_volumes bake 3"
 """Part of every bake's hash: files of another definition are baked anew."""
 
 LISTED = 12
@@ -267,7 +268,8 @@ def _write(work: _Work, cell: tuple[int, int], refined: State, limit: int) -> in
     measured, data = refined.measured, refined.data
     corner = np.array([*cell, 0]) * work.grid.cell_size
     dim = shade(refined, light, work.judge) if light.shape[1] else 1.0
-    planes = of_cell(data.planes, data.plane, data.position, corner, dim)
+    fill = fills(shaded(refined, dim), light, work.judge) if light.shape[1] else None
+    planes = of_cell(data.planes, data.plane, data.position, corner, dim, fill)
     payloads = split(work.scene, light)
     return work.place.write_cell(refined.tree, payloads, measured.valid, measured.offset, planes, limit)
 

@@ -243,12 +243,67 @@ def shade(state: State, light: np.ndarray, judge: Judge) -> float:
     """
     unlit = np.flatnonzero(confidence(state) < ENOUGH)
     state = dataclasses.replace(state, seen=state.seen.take(unlit))
-    mixed = _views(np.moveaxis(light, 1, 2), Judge(judge.mean[None], judge.mean))
-    mixed = np.ascontiguousarray(np.moveaxis(mixed, 2, 1))
-    dark, full = (_received(_shaded(state, value), mixed)[:, 0, 0] for value in (0.0, 1.0))
+    mixed = mean_view(light, judge)
+    dark, full = (luminance(shaded(state, value), mixed) for value in (0.0, 1.0))
     wanted, given, area = brightness(state.seen, judge)[0] - dark, full - dark, state.seen.at.area
     spread = float((area * given * given).sum())
     return float(np.clip((area * wanted * given).sum() / spread, 0.0, 1.0)) if spread > 0 else 1.0
+
+
+def mean_view(light: np.ndarray, judge: Judge) -> np.ndarray:
+    """Mix the functions of stored values.
+
+    Parameters
+    ----------
+    light : (points, functions, 9, 3) float32 ndarray
+        What is stored.
+    judge : Judge
+        Its mean view counts.
+
+    Returns
+    -------
+    (points, 1, 9, 3) float32 ndarray
+        Harmonics of luminance, in the first channel.
+    """
+    mixed = _views(np.moveaxis(light, 1, 2), Judge(judge.mean[None], judge.mean))
+    return np.ascontiguousarray(np.moveaxis(mixed, 2, 1))
+
+
+def luminance(state: State, mixed: np.ndarray) -> np.ndarray:
+    """Look up what receivers see.
+
+    Parameters
+    ----------
+    state : State
+        A cell.
+    mixed : (points, 1, 9, 3) float32 ndarray
+        From `mean_view`.
+
+    Returns
+    -------
+    (n,) float32 ndarray
+        Irradiance at each receiver.
+    """
+    return _received(state, mixed)[:, 0, 0]
+
+
+def shaded(state: State, value: float) -> State:
+    """Give a cell another shade.
+
+    Parameters
+    ----------
+    state : State
+        A cell.
+    value : float
+        Its shade, as `shade` finds it.
+
+    Returns
+    -------
+    State
+        The same data otherwise.
+    """
+    data = dataclasses.replace(state.data, shade=np.full_like(state.data.shade, value))
+    return dataclasses.replace(state, data=data)
 
 
 def confidence(state: State) -> np.ndarray:
@@ -285,12 +340,6 @@ def _fit(system: fit.System, traced: np.ndarray, halves: np.ndarray, threads: in
     """Fit to the mean of the halves; what they differ by says how far to trust the traced values."""
     prior = fit.trust(system, traced, halves)
     return fit.fit(system, traced, halves.mean(axis=0), prior, _threads(threads))
-
-
-def _shaded(state: State, value: float) -> State:
-    """The cell with another shade."""
-    data = dataclasses.replace(state.data, shade=np.full_like(state.data.shade, value))
-    return dataclasses.replace(state, data=data)
 
 
 def _threads(threads: int) -> int:

@@ -2,11 +2,11 @@
 
 Comes in: values at all data points, points, normals. Goes out: their weighted mean F_L at the finest level L, with
 
-    F_l(p) = (sum of weight * value + (ENOUGH - s)+ F_(l-1)(p)) / max(s, ENOUGH),    s = sum of weights
+    F_l(p) = (sum of weight * value + (ENOUGH - s)+ fill_l(p) F_(l-1)(p)) / max(s, ENOUGH),    s = sum of weights
 
-over the stencil that starts at level l. F_-1, the last resort, has no cosine and no planes. Its values are multiplied
-with the cell's shade, as it is dark in cracks, and for voxels without a data point the nearest one stands in. The
-ramp keeps the value continuous where the last trusted data point fades out.
+over the stencil that starts at level l. As it is dark in cracks, voxels hold back a part of what fills up there, and
+F_-1, the last resort, is multiplied with the cell's shade; it has no cosine and no planes, and the nearest data point
+stands in for voxels without one. The ramp keeps the value continuous where the last trusted data point fades out.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from .interpolate import PAIRS, DataPoints, last_resort, layers
+from .interpolate import PAIRS, DataPoints, filled, last_resort, layers
 from .stencil import Taps, in_order, pick
 
 __all__ = ["ENOUGH", "blend", "clamp"]
@@ -58,8 +58,8 @@ def blend(data: DataPoints, values: np.ndarray, points: np.ndarray, normals: np.
         total, start = _trust(found, len(some))
         left = (np.maximum(ENOUGH - total, 0) / np.float32(ENOUGH)) ** (level - start + 1)
         _add(result, values, found, some, pick(share, some) * (1 - left) / np.where(total > 0, total, 1))
-        share[some] *= left
         due[some] = np.where(left > 0, start - 1, DONE)
+        share[some] *= _held_back(data, points, some, left, start)
     some = np.flatnonzero(due > DONE)
     _add(result, values, last_resort(data, pick(points, some)), some, share[some])
     return result
@@ -103,6 +103,14 @@ def _trust(found: list[Taps], count: int) -> tuple[np.ndarray, np.ndarray]:
         total[taps.point] += in_order(taps.weight)
         start[taps.point] = np.maximum(start[taps.point], taps.level)
     return total, start
+
+
+def _held_back(data: DataPoints, points: np.ndarray, some: np.ndarray, left: np.ndarray, start: np.ndarray):
+    """(m,) what is left for coarser levels after voxels have held back theirs."""
+    for level in np.unique(start) if data.dims else ():
+        rows = np.flatnonzero((start == level) & (left > 0))
+        left[rows] *= filled(data, np.take(points, some[rows], axis=1), int(level))
+    return left
 
 
 def _add(result: np.ndarray, values: np.ndarray, found: Iterable[Taps], some: np.ndarray, scale: np.ndarray) -> None:

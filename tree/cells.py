@@ -137,7 +137,9 @@ def write_cell(
     sizes = {}
     arrays = {"offset": np.where(valid[:, None], offsets, 0).astype(np.int8), "valid": valid.astype(bool)}
     arrays |= {"planes": np.where(valid[:, None], planes.planes, NONE).astype(np.uint16), "plane": planes.plane}
-    units = {"offset": f"voxel size / {OFFSET_STEPS}", "plane": "1, 1, 1, m, m"}
+    if planes.fill is not None:
+        arrays["fill"] = planes.fill
+    units = {"offset": f"voxel size / {OFFSET_STEPS}", "plane": "1, 1, 1, m, m", "fill": "1 / 255"}
     own = common | {"shade": planes.shade}
     sizes[POINTS] = container.write(cell_path(folder, cell, POINTS), POINTS, arrays, own, units)
     for name in PAYLOADS:
@@ -328,7 +330,8 @@ def _read_planes(path: Path, file: container.Container, valid: np.ndarray) -> Ce
     """The planes of a file of data points; those without a data point have none."""
     if "planes" not in file.arrays or "plane" not in file.arrays:
         raise FileError(path, container.PREFIX_BYTES, "the data points have no occluding planes")
-    planes = CellPlanes(file.arrays["planes"], file.arrays["plane"], file.meta.get("shade"))
+    arrays = file.arrays
+    planes = CellPlanes(arrays["planes"], arrays["plane"], file.meta.get("shade"), arrays.get("fill"))
     reason = planes_defect(planes, len(valid))
     if not reason and (planes.planes[~valid] != NONE).any():
         reason = "a voxel without a data point has occluding planes"

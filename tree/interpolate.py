@@ -20,10 +20,10 @@ from .cells import OFFSET_STEPS
 from .dualcells import CORNERS, DualCells
 from .grid import Grid
 from .lookup import Atlas
-from .stencil import Taps, pick, taps
+from .stencil import Taps, in_order, pick, taps
 from .topology import Topology
 
-__all__ = ["PLANES", "DataPoints", "join", "last_resort", "layers", "weigh"]
+__all__ = ["PLANES", "DataPoints", "filled", "join", "last_resort", "layers", "weigh"]
 
 PLANES = 3
 """Occluding planes of a data point."""
@@ -62,6 +62,8 @@ class DataPoints:
         Lowest and highest corner of each cell's dense grid, relative to the origin [m].
     shade : (n,) float32
         What counts of a data point where none is seen, 0 to 1; the same all over a cell.
+    fill : (n,) float32
+        What counts of coarser levels where they fill up around a voxel, 0 to 1.
     """
 
     grid: Grid
@@ -74,6 +76,7 @@ class DataPoints:
     plane: np.ndarray
     boxes: np.ndarray
     shade: np.ndarray
+    fill: np.ndarray
 
     @cached_property
     def size(self) -> np.ndarray:
@@ -100,6 +103,11 @@ class DataPoints:
     def has_planes(self) -> np.ndarray:
         """(n,) bool."""
         return (self.planes >= 0).any(axis=1)
+
+    @cached_property
+    def dims(self) -> bool:
+        """Whether any voxel holds back light that coarser levels fill up."""
+        return bool((self.fill < 1).any())
 
     @cached_property
     def first_level(self) -> np.ndarray:
@@ -141,6 +149,7 @@ def join(
     planes: np.ndarray | None = None,
     plane: np.ndarray | None = None,
     shade: np.ndarray | None = None,
+    fill: np.ndarray | None = None,
 ) -> DataPoints:
     """Join the data points of some cells, which may be one.
 
@@ -160,6 +169,8 @@ def join(
         As in `DataPoints`.
     shade : (cells,) float, optional
         Shade of each cell; 1 when left out.
+    fill : (n,) float32, optional
+        As in `DataPoints`; 1 when left out.
 
     Returns
     -------
@@ -175,8 +186,8 @@ def join(
     plane = np.zeros((0, 5)) if plane is None else plane
     boxes = np.stack([low, high], axis=1) * grid.first_size
     shade = np.repeat(np.ones(len(topologies)) if shade is None else shade, [t.size for t in topologies])
-    shade = shade.astype(np.float32)
-    return DataPoints(grid, Atlas(topologies), level, coords, offset, valid, planes, plane, boxes, shade)
+    shade, fill = shade.astype(np.float32), np.ones(len(level), np.float32) if fill is None else fill
+    return DataPoints(grid, Atlas(topologies), level, coords, offset, valid, planes, plane, boxes, shade, fill)
 
 
 def layers(data: DataPoints, points: np.ndarray, normals: np.ndarray, finest: int | None = None) -> Iterator[Taps]:
@@ -211,6 +222,30 @@ def layers(data: DataPoints, points: np.ndarray, normals: np.ndarray, finest: in
         yield found
 
 
+def filled(data: DataPoints, points: np.ndarray, level: int) -> np.ndarray:
+    """Say what counts of coarser levels where they fill up.
+
+    Parameters
+    ----------
+    data : DataPoints
+        The bake.
+    points : (3, n) float64
+        Relative to the origin [m].
+    level : int
+        The finest level around the points.
+
+    Returns
+    -------
+    (n,) float32
+        1 less what the voxels around hold back, by their linear weights; 0 to 1, and 1 where the level has none.
+    """
+    left = np.ones(points.shape[1], np.float32)
+    for found in taps(data.grid, data.dual_cells, points, level) if data.dims else ():
+        if found.level == level:
+            left[found.point] -= in_order(found.weight * (1 - data.fill.take(found.row)))
+    return np.maximum(left, 0)
+
+
 def last_resort(data: DataPoints, points: np.ndarray) -> Iterator[Taps]:
     """Find what lights points where no data point can be trusted: the first level without cosine and planes.
 
@@ -231,7 +266,7 @@ def last_resort(data: DataPoints, points: np.ndarray) -> Iterator[Taps]:
         weight, used = found.weight, found.weight > 0
         if len(data.first_level):
             found.row[used] = data.stand_in(found.row[used])
-            weight /= np.where(used.any(axis=0), weight.sum(axis=0), 1)
+            weight /= np.where(used.any(axis=0), in_order(weight), 1)
             weight *= data.shade[found.row]
         else:
             weight[:] = 0.0

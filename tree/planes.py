@@ -37,11 +37,14 @@ class CellPlanes:
         Unit normal, distance from the cell's corner along it [m], width [m].
     shade : float
         0 to 1: what is left of the first level's light where no data point is seen, in cracks.
+    fill : (size,) uint8, optional
+        What is left of coarser levels' light where they fill up around a voxel, times 255; all of it when left out.
     """
 
     planes: np.ndarray
     plane: np.ndarray
     shade: float = 1.0
+    fill: np.ndarray | None = None
 
 
 def empty(size: int) -> CellPlanes:
@@ -61,7 +64,12 @@ def empty(size: int) -> CellPlanes:
 
 
 def of_cell(
-    planes: np.ndarray, plane: np.ndarray, position: np.ndarray, corner: np.ndarray, shade: float = 1.0
+    planes: np.ndarray,
+    plane: np.ndarray,
+    position: np.ndarray,
+    corner: np.ndarray,
+    shade: float = 1.0,
+    fill: np.ndarray | None = None,
 ) -> CellPlanes:
     """Take the planes that one cell's data points use.
 
@@ -76,6 +84,7 @@ def of_cell(
     corner : (3,) float64
         The cell's corner, (i, j, 0) times the cell's size [m].
     shade : float
+    fill : (size,) uint8, optional
         As in `CellPlanes`.
 
     Returns
@@ -99,7 +108,7 @@ def of_cell(
     number = np.full(len(plane) + 1, NONE, np.uint16)
     number[used[kept]] = np.arange(len(kept), dtype=np.uint16)
     rows = np.sort(number[planes], axis=1) if len(kept) < len(used) else number[planes]
-    return CellPlanes(rows, table, shade)
+    return CellPlanes(rows, table, shade, fill)
 
 
 def join(cells: Sequence[CellPlanes], corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -162,4 +171,6 @@ def planes_defect(cell: CellPlanes, size: int) -> str:
         return "a plane's width is not positive"
     if type(cell.shade) not in (int, float) or not 0 <= cell.shade <= 1:
         return f"the shade {cell.shade!r} is no number from 0 to 1"
+    if cell.fill is not None and (cell.fill.shape != (size,) or cell.fill.dtype != np.uint8):
+        return f"fill is {cell.fill.dtype} {cell.fill.shape}; uint8 {(size,)} is needed"
     return ""

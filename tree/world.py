@@ -243,7 +243,14 @@ def _data_points(grid: Grid, cells: list[folder.Cell]) -> DataPoints:
     corners = np.array([[*cell.topology.cell, 0] for cell in cells], np.float64).reshape(-1, 3) * grid.cell_size
     occluders = planes.join([cell.planes for cell in cells], corners)
     shade = np.array([cell.planes.shade for cell in cells])
-    return join(grid, [cell.topology for cell in cells], offset, valid, *occluders, shade)
+    fill = np.concatenate([np.zeros(0, np.float32), *(_fill(cell) for cell in cells)])
+    return join(grid, [cell.topology for cell in cells], offset, valid, *occluders, shade, fill)
+
+
+def _fill(cell: folder.Cell) -> np.ndarray:
+    """(size,) float32 what a cell's voxels leave of light that fills up."""
+    stored = cell.planes.fill
+    return np.ones(len(cell.valid), np.float32) if stored is None else stored / np.float32(255)
 
 
 def _join(name: str, cells: list[folder.Cell], atlas: Atlas) -> Values:

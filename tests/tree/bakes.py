@@ -72,8 +72,9 @@ def plain(name, dilation="partial"):
     return join(grid, trees, np.zeros((count, 3), np.int8), np.ones(count, bool))
 
 
-def rough(name, dilation="partial", seed=0):
-    """Data points that are moved by up to half a voxel, a quarter invalid, half of them with up to three planes."""
+def rough(name, dilation="partial", seed=0, dims=False):
+    """Data points that are moved by up to half a voxel, a quarter invalid, half of them with up to three planes; half
+    of them hold back any part of what fills up, if wanted."""
     trees, grid = grown(name, dilation)
     count, rng = sum(tree.size for tree in trees), np.random.default_rng(seed)
     offset, valid = rng.integers(-127, 128, (count, 3)).astype(np.int8), rng.random(count) < 0.75
@@ -87,7 +88,8 @@ def rough(name, dilation="partial", seed=0):
     planes[:, 0] = np.arange(count)
     near = np.abs((normal[planes] * bare.position[:, None]).sum(axis=2) - plane[planes, 3]) < bare.size[:, None]
     planes[~near | (rng.random((count, 3)) < 0.5)] = -1
-    return join(grid, trees, offset, valid, planes, plane)
+    fill = np.where(rng.random(count) < 0.5, rng.random(count), 1).astype(np.float32) if dims else None
+    return join(grid, trees, offset, valid, planes, plane, fill=fill)
 
 
 def points(data, count, seed=0):

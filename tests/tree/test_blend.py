@@ -113,7 +113,7 @@ def short_segments(data, count, seed=0):
 @pytest.mark.parametrize("dilation", ["none", "partial", "full"])
 def test_the_value_has_no_step_inside_the_dense_grids(name, dilation):
     """With normals, planes, moved and invalid data points, and every way to fill up: jumps shrink with the distance."""
-    data = bakes.rough(name, dilation)
+    data = bakes.rough(name, dilation, dims=True)
     values = noise(data)
     start, way, normals = short_segments(data, 1500)
     assert len(start) > 500
@@ -125,7 +125,7 @@ def test_the_value_has_no_step_inside_the_dense_grids(name, dilation):
 @pytest.mark.parametrize("name", ["soup", "five levels"])
 def test_long_segments_have_no_step_either(name):
     """Across many neighbourhoods: the largest change of each is followed down."""
-    data = bakes.rough(name)
+    data = bakes.rough(name, dims=True)
     start = bakes.points(data, 3000, seed=3)
     way = directions(len(start), 4) * np.random.default_rng(5).uniform(0.05, 2.0, (len(start), 1))
     kept = inside(data, start, way)
@@ -268,18 +268,21 @@ class Reader:
                 total, weights = total + w * data.shade[j] * self.values[j], weights + w
         return total / weights
 
+    def fill(self, p, level):
+        return 1 - sum(w * (1 - self.data.fill[row]) for row, w, _ in self.corners(p, level) if row >= 0)
+
     def value(self, p, n, level):
         if level < 0:
             return self.last(p)
         found = [(row, self.weight(row, a, p, n)) for row, a in self.stencil(p, level)]
         s, mean = sum(b for _, b in found), sum(b * self.values[row] for row, b in found)
-        rest = (module.ENOUGH - s) * self.value(p, n, level - 1) if s < module.ENOUGH else 0
+        rest = (module.ENOUGH - s) * self.fill(p, level) * self.value(p, n, level - 1) if s < module.ENOUGH else 0
         return (mean + rest) / max(s, module.ENOUGH)
 
 
 @pytest.mark.parametrize(("name", "dilation"), [("room", "partial"), ("five levels", "partial"), ("soup", "none")])
 def test_values_are_those_of_a_reader_written_from_the_format(name, dilation):
-    data = bakes.rough(name, dilation)
+    data = bakes.rough(name, dilation, dims=True)
     data = replace(data, shade=np.linspace(0.2, 1, len(data.valid)).astype(np.float32))
     points, values = bakes.points(data, 400, seed=2), noise(data)
     points = points[inside(data, points, 0 * points)]
