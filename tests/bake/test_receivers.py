@@ -137,6 +137,16 @@ def test_both_sides_of_leaves_have_receivers():
     assert found.area.sum() == pytest.approx(8, rel=1e-5)
 
 
+def test_a_ground_has_no_receivers_below_but_a_bridge_has():
+    ground, bridge = build_scenes.plane(6), build_scenes.plane(1, 2.0)
+    scene = prepare(build_scenes.snapshot([(ground, GRAY), (bridge, GRAY)]), Model())
+    found = everywhere(scene, 0.2)
+    below = found.normal[:, 2] < 0
+    assert (found.position[below, 2] == 2).all()
+    assert found.area[below].sum() == pytest.approx(4, rel=1e-5)
+    assert found.area[~below].sum() == pytest.approx(144 + 4, abs=0.2)  # a few see much of the back of the bridge
+
+
 def test_glass_before_a_wall_squeezes_nothing():
     glass = Material("glass", Channel((1.0,) * 3), transmission=Channel((1.0,)))
     room = build_scenes.box((-2 * REACH,) * 3, (2 * REACH,) * 3, inward=True)
