@@ -51,6 +51,8 @@ class LitSpots:
         What they shine on.
     surfaces : Surfaces
         Its materials.
+    wanted : bool
+        Whether light of lamps is modelled at all.
 
     Attributes
     ----------
@@ -60,9 +62,11 @@ class LitSpots:
         Of all lamps, those that are round and no points.
     """
 
-    def __init__(self, lamps: Lamps, tracer: Tracer, surfaces: Surfaces) -> None:
+    def __init__(self, lamps: Lamps, tracer: Tracer, surfaces: Surfaces, wanted: bool = True) -> None:
         self.lamps, self.tracer, self.surfaces = lamps, tracer, surfaces
-        chosen = lamps.shadow & (_concentration(lamps, tracer) > CONCENTRATED)
+        chosen = (
+            lamps.shadow & (_concentration(lamps, tracer) > CONCENTRATED) if wanted else np.zeros(lamps.count, bool)
+        )
         power = np.where(chosen, lamps.power, 0)
         total = power.sum()
         self.count = int((power > 0).sum())
@@ -96,7 +100,7 @@ class LitSpots:
         rows = np.flatnonzero(u[0] < self._cdf[-1])
         lamp = np.searchsorted(self._cdf, u[0][rows], side="right")
         start, direction = (np.array(part) for part in self.lamps.emit(lamp, tuple(part[rows] for part in u[1:5])))
-        hits, light, ends = self._shine(lamp, start.copy(), direction, lambda some, step: passing(rows[some], step))
+        hits, light, ends = self._shine(lamp, start, direction, lambda some, step: passing(rows[some], step))
         spot, normal = self._arrive(start, direction, hits, ends)
         toward = spot - position[:, rows]
         facing = -warp.dot(toward, normal)
@@ -123,14 +127,16 @@ class LitSpots:
         Returns
         -------
         (n,) float32 ndarray
-            [1/sr]; it holds where the lamp is seen.
+            [1/sr]; 0 where the lamp's ray would have ended before.
         """
         density = self._pdf_area(lamp, source, normal) * _steradians(toward, -warp.dot(toward, normal))
-        unsure = np.flatnonzero((self.is_soft[lamp]) & (density > 0))
-        if len(unsure):
-            ways = (np.ascontiguousarray(part[:, unsure]) for part in (spot, source))
-            density[unsure] *= ~self.tracer.blocked(*ways, np.full(len(unsure), TARGET_SHORTENED))
-        return density
+        some = np.flatnonzero(density > 0)
+        start = self._off_lamp((spot + source)[:, some], -source[:, some])
+        seen, tint = unblocked(self, start, spot[:, some] - start, TARGET_SHORTENED, np.ones(len(some), bool))
+        seen = seen[(warp.largest(np.broadcast_to(tint, (3, len(seen)))) > 0) | ~self.is_soft[lamp[some[seen]]]]
+        out = np.zeros_like(density)
+        out[some[seen]] = density[some[seen]]
+        return out
 
     def _shine(self, lamp: np.ndarray, origin: np.ndarray, direction: np.ndarray, passing):
         """Follow lamps' rays to what they meet: hits, what light is left, the whole ways [m].
@@ -138,12 +144,20 @@ class LitSpots:
         Soft lamps are seen whole or in part, so that what stands before the middle says nothing of the light: their
         rays pass all that is transparent, and end in nothing where it is not.
         """
-        soft, light = self.is_soft[lamp], np.ones_like(origin)
-        uniform = lambda some, step: np.where(soft[some], np.float32(0), passing(some, step))  # noqa: E731
+        soft, light, origin = self.is_soft[lamp], np.ones_like(origin), self._off_lamp(origin, direction)
+
+        def uniform(some: np.ndarray, step: int) -> np.ndarray:
+            return np.where(soft[some], np.float32(0), passing(some, step))
+
         hits, travelled = meet(self, origin, direction, light, uniform)
         light[:, soft] = 1
         hits.triangle[soft & self.surfaces.transparent[hits.triangle]] = MISS
         return hits, light, travelled
+
+    def _off_lamp(self, start: np.ndarray, way: np.ndarray) -> np.ndarray:
+        """Starts of lamps' rays, off a surface that a lamp may lie on."""
+        length = np.maximum(np.sqrt(warp.dot(way, way)), np.float32(1e-30))
+        return start + way * (self.tracer.offset(start, np.zeros(start.shape[1], np.float32)) / length)
 
     def _arrive(self, start: np.ndarray, direction: np.ndarray, hits: Hits, travelled: np.ndarray):
         """Points off the surfaces that rays meet, and unit normals towards where they come from."""

@@ -28,7 +28,7 @@ GRAZING = np.float32(1e-6)
 FIRST_VERTEX = 2
 SCATTER, LAMP, EMITTER, SKY, PER_VERTEX = 0, 2, 6, 9, 12
 HASHED = 1 << 16
-"""Dimensions from here on are hashed, not Sobol points: roulette, transparency, the sun's disk."""
+"""Dimensions from here on are hashed, not Sobol points: roulette, transparency, the sun's disk, lit spots."""
 ROULETTE, SUN_DISK, PASS, SPOT, HASHED_PER_VERTEX = 0, 1, 3, 40, 64
 
 
@@ -149,12 +149,14 @@ def trace(scene: Scene, wave: Wave, numbers: Numbers, bounces: int) -> Radiance:
     Returns
     -------
     Radiance
-        Direct light of lamps and suns along the rays is not part of it: they are no surfaces.
+        Direct light of lamps and suns along the rays is not part of it: they are no surfaces. Where the scene has
+        `lit_spots`, what paths find of them at their first hit is weighed against `LitSpots.sample` at their start,
+        which is the caller's to add.
 
     Notes
     -----
     Error: unbiased up to the bounce limit; noise only. Tested against closed forms in `tests/bake`.
-    Source: Kajiya 1986; Veach 1997, section 9.2, balance heuristic for emitters and an uneven sky.
+    Source: Kajiya 1986; Veach 1997, section 9.2, balance heuristic for emitters, an uneven sky and lit spots.
     """
     light = Radiance.zeros(scene, len(wave.lane))
     for bounce in range(bounces + 1):
@@ -280,7 +282,7 @@ def _add_lit_spots(scene: Scene, wave: Wave, vertex: Vertex, numbers: Numbers, b
     if not scene.model.local or not scene.lit_spots.count:
         return
     u = numbers.draw(wave.lane, HASHED + bounce * HASHED_PER_VERTEX + SPOT, lit_spots.NUMBERS)
-    ends = passing(numbers, wave.lane, bounce + 1)
+    ends = passing(numbers, wave.lane, bounce + 1)  # as the path's own next leg: what either brings is only added
     some, toward, radiance, density = scene.lit_spots.sample(vertex.position, u, ends)
     position, normal = vertex.position[:, some], vertex.normal[:, some]
     length = np.sqrt(warp.dot(toward, toward))

@@ -91,6 +91,10 @@ class Tracer:
         """Whether any triangle may let light pass."""
         return self._transparent is not None
 
+    def forget(self) -> None:
+        """Set the counts of rays and seconds back to 0."""
+        self.rays, self.seconds = 0, 0.0
+
     def intersect(self, origin: np.ndarray, direction: np.ndarray) -> Hits:
         """First hit of each ray.
 

@@ -50,8 +50,8 @@ LARGE = 8
 TINY = 1e-3
 """What a piece adds to a tile besides its points, so that tiles of tiny triangles stay small."""
 
-DOWN = -1e-3
-"""Normals below this vertical component face down."""
+DOWN = -0.5
+"""Normals below this vertical component face down: those of slopes up to 60 degrees."""
 
 WITNESSES = 4
 """Feelers of a back side whose ends are judged in their turn."""
@@ -395,12 +395,12 @@ def _on_triangle(corners: np.ndarray, bits: np.ndarray) -> np.ndarray:
 def _is_free(scene: Scene, receivers: Receivers, crack: float) -> np.ndarray:
     """(n,) whether a side sees free space: few backs of opaque faces, and not only what lies against it.
 
-    The underside of a ground is not free: it faces down, and there is nothing below. A back side among fronts is free
-    only where most of these are: nobody is inside a closed wall that furniture sticks into.
+    The underside of a ground is not free: it is a back that faces down, and there is nothing below. A back side among
+    fronts is free only where most of these are: nobody is inside a closed wall that furniture sticks into.
     """
     direction, hits, met = _feel(scene, lifted(scene, receivers), receivers.normal.T, receivers.key)
     free = _has_space(hits, direction, met, crack)
-    free &= (hits.triangle != MISS).reshape(-1, FEELERS).any(axis=1) | (receivers.normal[:, 2] > DOWN)
+    free &= (hits.triangle != MISS).reshape(-1, FEELERS).any(axis=1) | ~_face_down(receivers)
     back = np.flatnonzero(free & ~receivers.front)
     lane = (back[:, None] * FEELERS + np.arange(0, FEELERS, FEELERS // WITNESSES)).reshape(-1)
     lane = lane[met[lane] & (warp.dot(hits.normal[:, lane], direction[:, lane]) < 0)]
@@ -412,6 +412,11 @@ def _is_free(scene: Scene, receivers: Receivers, crack: float) -> np.ndarray:
     votes = np.bincount(lane // FEELERS, np.where(good, 1, -1), len(free))
     free[back] &= votes[back] >= 0
     return free
+
+
+def _face_down(receivers: Receivers) -> np.ndarray:
+    """(n,) backs that face down."""
+    return ~receivers.front & (receivers.normal[:, 2] < DOWN)
 
 
 def _feel(scene: Scene, position: np.ndarray, normal: np.ndarray, key: np.ndarray):

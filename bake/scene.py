@@ -98,8 +98,8 @@ def prepare(snapshot: Snapshot, model: Model) -> Scene:
     reflector_rows = lamp_rows[snapshot.lights.reflector[lamp_rows]]
     tracer = Tracer(soup.corners, surfaces.transparent)
     lamps = Lamps(snapshot.lights, lamp_rows, snapshot.origin, tracer.size)
-    lit_spots = LitSpots(lamps, tracer, surfaces)
-    tracer.rays, tracer.seconds = 0, 0.0  # looking around from the lamps is no transport
+    lit_spots = LitSpots(lamps, tracer, surfaces, model.local)
+    tracer.forget()  # looking around from the lamps is no transport
     return Scene(
         soup=soup,
         tracer=tracer,

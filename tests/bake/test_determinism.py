@@ -234,6 +234,7 @@ def house():
     ]
     lamps = build_scenes.lamps(
         {"position": (-1, 0.5, 2.0), "strength": (30, 20, 10)},
+        {"position": (0.6, 0.5, 2.45), "strength": (6, 6, 9)},  # in a corner, where it lights a spot
         {"kind": LightKind.SUN, "frame": build_scenes.sun_frame((0.3, 0.4, 0.8)), "strength": (3, 3, 3)},
     )
     return build_scenes.snapshot(parts, lamps, (0.5, 0.7, 1))
@@ -244,6 +245,10 @@ def house_baked(tmp_path_factory):
     target = tmp_path_factory.mktemp("house")
     job.bake(house(), target, HOUSE, threads=1)
     return target
+
+
+def test_a_lamp_of_the_house_lights_a_spot():
+    assert prepare(house(), Model()).lit_spots.count == 1
 
 
 def test_the_house_is_subdivided_fitted_and_has_planes_on_both_sides_of_its_borders(house_baked, tmp_path):

@@ -6,16 +6,13 @@ import dataclasses
 
 import build_scenes
 import numpy as np
-from gi_volumes.bake import fills, job
+from gi_volumes.bake import fills
 from gi_volumes.bake.receivers import Receivers
-from gi_volumes.bake.settings import Settings
-from gi_volumes.bake.snapshot import Channel, Material
 from gi_volumes.bake.survey import Judge, Seen, State, luminance, mean_view
-from gi_volumes.tree import build, folder, interpolate
+from gi_volumes.tree import build, interpolate
 from gi_volumes.tree.grid import Grid
 from gi_volumes.tree.stencil import Taps
 
-WHITE = Material("white", Channel((0.6,) * 3), specular_level=0.0)
 DARK = 0.3
 JUDGE = Judge(np.ones((1, 1, 3)), np.ones((1, 3)))
 
@@ -67,11 +64,10 @@ def test_noise_of_receivers_darkens_next_to_nothing():
     assert abs(luminance(dim, mean_view(constant(state), JUDGE)).mean() - 1) < 0.002
 
 
-def test_voxels_in_the_open_hold_nothing_back(tmp_path):
-    settings = Settings(samples=64, bounces=3, error=0.1)
-    job.bake(build_scenes.snapshot([(build_scenes.plane(3.0), WHITE)], sky=(1, 1, 1)), tmp_path, settings)
-    cells = [folder.read_cell(tmp_path, tuple(entry["cell"])) for entry in folder.load_header(tmp_path)["cells"]]
-    assert all((cell.planes.fill == 255).all() for cell in cells)
+def test_voxels_hold_nothing_back_where_what_fills_up_is_right():
+    state = dark_side()
+    seen = Seen(state.seen.at, np.ones_like(state.seen.light))
+    assert (fills.fills(dataclasses.replace(state, seen=seen), constant(state), JUDGE) == 255).all()
 
 
 def test_what_voxels_hold_back_is_the_bounded_least_squares_solution():

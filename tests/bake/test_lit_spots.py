@@ -16,7 +16,8 @@ from scipy import integrate
 
 HEIGHT, GAP, ALBEDO = 2.0, 0.05, 0.8
 FARTHER = 0.25  # [m] under the ceiling: paths find spots of that size well enough to be compared with
-STANDARD_ERRORS = 3.5
+AT = np.array([-0.6, 0.4, 0.5])
+STANDARD_ERRORS = 3.5  # once in 2,000 seeds, and the seeds are fixed
 WHITE = Material("white", Channel((ALBEDO,) * 3), specular_level=0.0)
 BLACK = Material("black", Channel((0.0,) * 3), specular_level=0.0)
 GLASS = Material("glass", Channel((0.5,) * 3), alpha=Channel((0.5,)), alpha_mode="blend", specular_level=0.0)
@@ -46,7 +47,7 @@ def by_chance(scene: Scene) -> Scene:
 
 def measured(scene: Scene, sensor, points: int, samples: int, bounces: int, seed: int = 0) -> np.ndarray:
     """(points,) luminance-free sum of what independent points at one place measure."""
-    position = np.repeat(np.array([[-0.6], [0.4], [0.5]], np.float32), points, axis=1)
+    position = np.repeat(AT.astype(np.float32)[:, None], points, axis=1)
     keys = np.arange(points, dtype=np.uint32) + np.uint32(1000 * seed)
     return gather(scene, sensor, position, keys, Effort(samples, bounces, seed)).local[:, 0].sum(axis=1)
 
@@ -101,6 +102,54 @@ def test_spots_found_from_the_lamp_and_by_chance_give_the_same_light(lamp, senso
     chance = measured(by_chance(scene), sensors[sensor], points, 512, 3, seed=1)
     assert abs(z_score(both, chance)) < STANDARD_ERRORS
     assert abs(z_score(both, 1.2 * chance)) > STANDARD_ERRORS
+
+
+TILT = np.linalg.qr(np.random.default_rng(7).normal(size=(3, 3)))[0]
+TILT = TILT * np.sign(np.linalg.det(TILT))
+MASK = Material("mask", Channel((0.5,) * 3), alpha=Channel((1.0,)), alpha_mode="mask", specular_level=0.0)
+
+
+def tilted_room(lamp: dict, gap: float) -> Scene:
+    """A lamp that shines down in a room that is turned about the point that is measured: no number is round there."""
+    walls = (build_scenes.box((-2, -2, 0), (2, 2, HEIGHT), inward=True) - AT) @ TILT.T + AT
+    position = (np.array([0.3, 0.2, HEIGHT - gap]) - AT) @ TILT.T + AT
+    lights = build_scenes.lamps({**lamp, "position": position, "frame": TILT})
+    return prepare(build_scenes.snapshot([(walls, WHITE)], lights), Model())
+
+
+@pytest.mark.parametrize("gap", [0.0, -5e-5, 1e-4, 0.02])
+@pytest.mark.parametrize("name", ["point", "panel", "sphere"])
+def test_lamps_on_surfaces_and_just_behind_them_lose_and_win_no_light(name, gap):
+    if name == "point" and gap == 1e-4:
+        pytest.skip("chance never finds a spot of a tenth of a millimetre, which holds half of the light")
+    scene = tilted_room(LAMPS[name], gap)
+    both = measured(scene, HarmonicsSensor(), 256, 256, 3)
+    chance = measured(by_chance(scene), HarmonicsSensor(), 256, 256, 3, seed=1)
+    assert np.isfinite(both).all()
+    assert abs(z_score(both, chance)) < STANDARD_ERRORS or np.allclose(both, chance)
+
+
+def test_a_leaf_cut_out_before_a_soft_lamp_hides_it_alike_from_either_side():
+    leaf = build_scenes.quad((0.2, 0.1, 1.72), (0.32, 0.1, 1.72), (0.32, 0.3, 1.72), (0.2, 0.3, 1.72))
+    scene = room({"size": (0.1, 0), "strength": (5, 4, 3)}, (leaf, MASK), gap=0.2)
+    assert scene.lit_spots.count == 1
+    assert scene.tracer.has_transparent
+    both = measured(scene, up(512), 512, 256, 3)
+    chance = measured(by_chance(scene), up(512), 512, 512, 3, seed=1)
+    assert abs(z_score(both, chance)) < STANDARD_ERRORS
+    assert abs(z_score(both, 1.1 * chance)) > STANDARD_ERRORS
+
+
+def test_many_lamps_of_which_some_light_spots_and_some_cast_no_shadow_are_all_there():
+    rng, walls = np.random.default_rng(3), build_scenes.box((-2, -2, 0), (2, 2, HEIGHT), inward=True)
+    rows = [{"position": (*rng.uniform(-1.9, 1.9, 2), z), "strength": (1, 1, 1)} for z in rng.uniform(0.3, 1.95, 12)]
+    rows[3]["shadow"] = rows[7]["shadow"] = False
+    scene = prepare(build_scenes.snapshot([(walls, WHITE)], build_scenes.lamps(*rows)), Model())
+    assert 0 < scene.lit_spots.count < 12
+    both = measured(scene, up(512), 512, 256, 4)
+    chance = measured(by_chance(scene), up(512), 512, 1024, 4, seed=1)
+    assert abs(z_score(both, chance)) < STANDARD_ERRORS
+    assert abs(z_score(both, 1.1 * chance)) > STANDARD_ERRORS
 
 
 def test_a_path_that_meets_a_spot_is_not_blinded():

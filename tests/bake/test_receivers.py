@@ -147,6 +147,15 @@ def test_a_ground_has_no_receivers_below_but_a_bridge_has():
     assert found.area[~below].sum() == pytest.approx(144 + 4, abs=0.2)  # a few see much of the back of the bridge
 
 
+def test_a_block_that_floats_has_receivers_on_all_of_its_sides():
+    """Also where it leans down and sees nothing: only backs that face down are undersides."""
+    turn, block = np.radians(3.0), build_scenes.box((-1, -1, -1), (1, 1, 1))
+    tilt = np.array([[np.cos(turn), 0, -np.sin(turn)], [0, 1, 0], [np.sin(turn), 0, np.cos(turn)]])
+    found = everywhere(prepare(build_scenes.snapshot([(block @ tilt, GRAY)]), Model()), 0.1)
+    assert found.area.sum() == pytest.approx(24, rel=1e-5)
+    assert found.front.all()
+
+
 def test_glass_before_a_wall_squeezes_nothing():
     glass = Material("glass", Channel((1.0,) * 3), transmission=Channel((1.0,)))
     room = build_scenes.box((-2 * REACH,) * 3, (2 * REACH,) * 3, inward=True)

@@ -159,6 +159,22 @@ def test_planes_of_a_wrong_shape_or_type_are_refused():
         assert "is needed" in planes_defect(CellPlanes(planes_, plane), 60)
 
 
+def test_what_fills_up_of_a_wrong_shape_or_type_is_refused():
+    good = whole()
+    for fill in (np.zeros(59, np.uint8), np.zeros(60, np.int8), np.zeros((60, 1), np.uint8), np.zeros(60, np.float32)):
+        assert "fill is" in planes_defect(replace(good, fill=fill), 60)
+    assert planes_defect(replace(good, fill=np.zeros(60, np.uint8)), 60) == ""
+
+
+def test_a_cell_returns_what_its_voxels_leave_and_none_where_it_has_none(bake):
+    place, topology, valid, stored = bake
+    assert folder.read_cell(place, CELL).planes.fill is None
+    fill = np.random.default_rng(1).integers(0, 256, topology.size).astype(np.uint8)
+    offset = np.zeros((topology.size, 3), np.int8)
+    folder.write_cell(place, topology, {}, valid, offset, {"bake": "b"}, replace(stored, fill=fill))
+    assert np.array_equal(folder.read_cell(place, CELL).planes.fill, fill)
+
+
 @pytest.fixture
 def bake(tmp_path):
     topology = build.build(meshes.soup(40, 4), Grid(), CELL)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gi_volumes.tree import build, folder, harmonics, world
+from gi_volumes.tree import build, folder, harmonics, planes, world
 from gi_volumes.tree.grid import Grid
 from gi_volumes.tree.interpolate import NEAR, weigh
 from hypothesis import given, settings
@@ -45,6 +45,25 @@ def make(place, values, valid=None, origin=ORIGIN, transports=None, offset=None)
     transports = transports or {name: {} for name in values}
     folder.assemble(place, {"bake": "b", "grid": grid, "transports": transports})
     return world.load(place)
+
+
+def test_what_voxels_hold_back_reaches_the_irradiance(tmp_path):
+    """Fine data points that a plane hides everywhere leave all light to the first level; the second holds back half."""
+    grid, (topology, *_) = Grid(), [build.build(ROOM, Grid(), cell, flat=-1.0) for cell in CELLS]
+    size, level = topology.size, topology.voxels()[0]
+    rows = np.full((size, 3), planes.NONE, np.uint16)
+    rows[level > 0, 0] = 0
+    above = np.array([[0, 0, 1, 1000, 0.1]], np.float32)
+    light = uniform(2.0)(np.zeros((size, 3))).astype(np.float32)
+    found = []
+    for fill in (None, np.where(level == 1, 128, 255).astype(np.uint8)):
+        hidden = planes.CellPlanes(rows, above, fill=fill)
+        still = np.zeros((size, 3), np.int8)
+        folder.write_cell(tmp_path, topology, {"local": light}, np.ones(size, bool), still, {"bake": "b"}, hidden)
+        folder.assemble(tmp_path, {"bake": "b", "grid": grid, "transports": {"local": {}}})
+        found.append(world.load(tmp_path).irradiance(np.array([(-5.0, -4.0, 0.0)]), np.array([(0, 0, 1.0)])))
+    np.testing.assert_allclose(found[0], 2.0, rtol=1e-3)
+    np.testing.assert_allclose(found[1], 2.0 * 128 / 255, rtol=1e-3)
 
 
 def uniform(*strengths):
