@@ -76,7 +76,7 @@ def find(scene: Scene, pairs: Pairs, weight: np.ndarray, position: np.ndarray, f
     planes, plane = _merge(scene.soup.corners[triangle].astype(np.float64), finest)
     plane = plane[place.reshape(-1, 2)]
     both = plane[:, 1] != plane[:, 0]
-    point = np.concatenate([pairs.point[hidden], pairs.point[hidden][both]])
+    point = np.concatenate([pairs.point[hidden], pairs.point[hidden][both]]).astype(np.int64)
     code = point * max(len(planes), 1) + np.concatenate([plane[:, 0], plane[both, 1]])
     code, place = np.unique(code, return_inverse=True)
     sums = np.bincount(place.reshape(-1), np.concatenate([weight[hidden], weight[hidden][both]]), len(code))

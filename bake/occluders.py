@@ -46,6 +46,9 @@ BOOST = 8.0
 CHUNK = 1 << 21
 """Pairs times candidates held at a time: about 100 MB."""
 
+PASSED = 1 << 19
+"""Pairs whose planes are evaluated at a time: about 60 MB."""
+
 
 @dataclass(frozen=True)
 class Occluders:
@@ -159,19 +162,21 @@ class _Task:
     def _values(self, area: np.ndarray) -> np.ndarray:
         """(m,) what hiding each pair gains: its part of the receiver's weight, negative where it is visible."""
         total = np.bincount(self.pairs.receiver, self.weight, len(self.place))
-        part = self.weight * (area / np.maximum(total, ENOUGH))[self.pairs.receiver]
-        return np.where(self.visible, -LOSS * part, part)
+        part = (area / np.maximum(total, ENOUGH))[self.pairs.receiver]
+        part *= self.weight
+        part[self.visible] *= -LOSS
+        return part
 
     def solve(self, threads: int) -> _Slots:
         """Choose planes for all data points, then again for those that left receivers without light."""
         shape = (len(self.data.valid), SLOTS)
         slots = _Slots(np.zeros((*shape, 4)), np.full(shape, -1))
         self._solve_all(np.unique(self.pairs.point[~self.visible]), self.value, slots, threads)
-        boost = np.ones(len(self.value))
+        value = self.value.copy()
         for _ in range(BOOSTS):
             lost = self._best_of_lost(slots)
-            boost[lost] *= BOOST
-            self._solve_all(np.unique(self.pairs.point[lost]), self.value * boost, slots, threads)
+            value[lost] *= BOOST
+            self._solve_all(np.unique(self.pairs.point[lost]), value, slots, threads)
         self._free(slots)
         return slots
 
@@ -205,14 +210,20 @@ class _Task:
             out[has, slot] = self.falloff.factor(height, slots.code[point[has], slot])
         return out
 
+    def passed(self, slots: _Slots, rows: np.ndarray) -> np.ndarray:
+        """(k,) what all planes together leave of some pairs, a part of them at a time."""
+        parts = np.split(rows, range(PASSED, len(rows), PASSED))
+        return np.concatenate([self.factors(slots, part).prod(axis=1) for part in parts])
+
     def _best_of_lost(self, slots: _Slots) -> np.ndarray:
         """For each receiver whose visible data points are all but hidden, the pair that would bring back the most.
 
         Receivers in other cells have data points there that are not known here.
         """
         rows = np.flatnonzero(self.visible & (slots.code >= 0).any(axis=1)[self.pairs.point])
-        hidden = np.zeros(len(self.weight))
-        hidden[rows] = self.weight[rows] * (1 - self.factors(slots, rows).prod(axis=1))
+        hidden, gone = np.zeros(len(self.weight)), 1 - self.passed(slots, rows)
+        gone *= self.weight[rows]
+        hidden[rows] = gone
         left = self.lit - np.bincount(self.pairs.receiver, hidden, len(self.place))
         lost = (left < np.minimum(self.lit / 2, ENOUGH)) & (self.lit > FAINT) & self.own
         rows = rows[lost[self.pairs.receiver[rows]] & (hidden[rows] > 0)]
@@ -234,7 +245,7 @@ class _Task:
         planes = np.full(used.shape, -1, np.int32)
         planes[used] = row.reshape(-1)
         planes = np.take_along_axis(planes, np.argsort(~used, axis=1, kind="stable"), axis=1)
-        left = self.weight * self.factors(slots, np.arange(len(self.weight))).prod(axis=1)
+        left = self.weight * self.passed(slots, np.arange(len(self.weight)))
         kept = [float(left[of].sum() / max(self.weight[of].sum(), 1e-30)) for of in (self.visible, ~self.visible)]
         return Occluders(planes, table, self.lit <= FAINT, *kept)
 

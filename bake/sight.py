@@ -29,12 +29,15 @@ TAPS = 8
 """Taps that a tile's receivers have at most, in the mean: 16 where levels meet, less those behind the surface."""
 
 
+FIELDS = ("receiver", "point", "weight", "blocker", "reach")
+
+
 @dataclass(frozen=True)
 class Pairs:
     """Receivers and data points with some weight there; sorted by data point, then by receiver.
 
-    receiver : (m,) int64, row of the receivers
-    point : (m,) int64, row of the data points
+    receiver : (m,) int32, row of the receivers
+    point : (m,) int32, row of the data points
     weight : (m,) float32, stencil weight times the cosine at the receiver
     blocker : (m, 2) int32, the first opaque triangle seen from the receiver, and from the data point; -1 for none
     reach : (m,) float32, part of the way from the receiver to the first one; 1 for none
@@ -64,7 +67,7 @@ class Pairs:
         Pairs
             In the order of `rows`.
         """
-        return Pairs(self.receiver[rows], self.point[rows], self.weight[rows], self.blocker[rows], self.reach[rows])
+        return Pairs(*(getattr(self, name)[rows] for name in FIELDS))
 
 
 def look(
@@ -107,8 +110,7 @@ def look(
 
     count, step = len(receivers.key), TILE_LANES // TAPS
     run_tiles(work, [np.arange(a, min(a + step, count)) for a in range(0, count, step)], threads, progress)
-    pairs = _join([found[first] for first in sorted(found)])
-    return pairs.take(np.lexsort((pairs.receiver, pairs.point)))
+    return _sorted([found.pop(first) for first in sorted(found)])
 
 
 def _levels(scene: Scene, data: interpolate.DataPoints, receivers: Receivers, rows: np.ndarray) -> Iterator[Pairs]:
@@ -120,7 +122,7 @@ def _levels(scene: Scene, data: interpolate.DataPoints, receivers: Receivers, ro
         start = np.ascontiguousarray(lifted(scene, receivers)[:, low[receiver]])
         blocker, reach = _blockers(scene, start, data.position[point].T.astype(np.float32))
         seen[low] += np.bincount(receiver, weight * (blocker[:, 0] == MISS), len(low))
-        yield Pairs(rows[low[receiver]], point, weight, blocker, reach)
+        yield Pairs(rows[low[receiver]].astype(np.int32), point.astype(np.int32), weight, blocker, reach)
 
 
 def _taps(data: interpolate.DataPoints, receivers: Receivers, finest: int):
@@ -152,6 +154,23 @@ def _first(scene: Scene, origin: np.ndarray, way: np.ndarray) -> tuple[np.ndarra
 
 def _join(parts: list[Pairs]) -> Pairs:
     """All pairs."""
-    none = np.zeros(0, np.int64)
-    empty = Pairs(none, none, np.zeros(0, np.float32), np.zeros((0, 2), np.int32), np.zeros(0, np.float32))
-    return Pairs(*(np.concatenate([getattr(part, name) for part in (empty, *parts)]) for name in vars(empty)))
+    return Pairs(*(np.concatenate([getattr(part, name) for part in (_none(), *parts)]) for name in FIELDS))
+
+
+def _sorted(parts: list[Pairs]) -> Pairs:
+    """All pairs in their order, and no parts any more: field after field, so that only one is held twice."""
+    fields = [[getattr(part, name) for part in (_none(), *parts)] for name in FIELDS]
+    parts.clear()
+    for number, field in enumerate(fields):
+        fields[number] = np.concatenate(field)
+        field.clear()
+    order = np.lexsort((fields[0], fields[1]))
+    for number, field in enumerate(fields):
+        fields[number] = field[order]
+    return Pairs(*fields)
+
+
+def _none() -> Pairs:
+    """No pairs."""
+    none = np.zeros(0, np.int32)
+    return Pairs(none, none, np.zeros(0, np.float32), np.zeros((0, 2), np.int32), np.zeros(0, np.float32))

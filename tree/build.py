@@ -12,12 +12,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from . import bits
-from .dilate import DILATIONS, dilate, own
+from .dilate import DILATIONS, dilate, neighbours, others, own
 from .first_level import occupied_cells
 from .grid import BRANCH, Grid
 from .need import FLAT
 from .outline import Outline, outline
-from .region import finder
+from .region import Region, finder
 from .topology import MAX_POINTS, Topology, child_coords, link_blocks
 
 __all__ = ["build", "fit", "grow", "occupied_cells"]
@@ -127,7 +127,8 @@ def fit(
         Cap on the number of data points, dilation included; more than `MAX_POINTS` is cut to it.
     asked : sequence of (b, 3) int64, optional
         For each level voxels that are wanted by themselves, solid or not: in front of thin surfaces, for example.
-        Those outside of the cell do not count; those of the first level are there anyway.
+        They come with the solid voxels beside them. Those beside none, those outside of the cell, and those that
+        `Outline.foreseen` leaves out, do not count; those of the first level are there anyway.
 
     Returns
     -------
@@ -143,6 +144,8 @@ def fit(
     for level in range(1, len(need)):
         need[level] = np.minimum(need[level], need[level - 1][outline.parent[level]])
     chosen = _descendants(outline, [values > 0 for values in need])
+    if asked is not None:
+        asked = [outline.foreseen(level, coords) for level, coords in enumerate(asked)]
     order = _Order(outline, chosen, need, [np.zeros(len(values)) for values in need], asked)
     return _largest(outline, order, dilation, min(max_points, MAX_POINTS))
 
@@ -214,33 +217,37 @@ def _largest(outline: Outline, order: _Order, dilation: str, max_points: int) ->
     if dilation not in DILATIONS:
         raise ValueError(f"dilation {dilation!r}; use one of {', '.join(DILATIONS)}")
     room = max_points - int(np.prod(outline.dense.shape))
-    many = int(np.searchsorted(order.solid, room, side="right")) - 1
-    found = _voxels(outline, order.divided(many), dilation, order.asked)
+    many, elsewhere = int(np.searchsorted(order.solid, room, side="right")) - 1, others(outline, dilation)
+    found = _voxels(outline, order.divided(many), dilation, elsewhere, order.asked)
     few = many if _count(found) <= room else 0
     if few < many or _count(found) > room:
-        dilation, found = _least(outline, order, dilation, room)
+        dilation, found = _least(order, dilation, elsewhere, room)
     while order.solid[many] - order.solid[few] > CLOSE * max_points and many - few > 1:
         middle = (few + many) // 2
-        tried = _voxels(outline, order.divided(middle), dilation, order.asked)
+        tried = _voxels(outline, order.divided(middle), dilation, elsewhere, order.asked)
         if _count(tried) <= room:
             few, found = middle, tried
         else:
             many = middle
-    plain = _voxels(outline, order.divided(few), "none", order.asked)
+    plain = _voxels(outline, order.divided(few), "none", elsewhere, order.asked)
     return _to_topology(outline, found, max(_count(found) - _count(plain), 0), order.refused(few))
 
 
-def _least(outline: Outline, order: _Order, dilation: str, room: int) -> tuple[str, list[np.ndarray]]:
+def _least(order: _Order, dilation: str, elsewhere: list[np.ndarray], room: int) -> tuple[str, list[np.ndarray]]:
     """The best dilation whose voxels fit, where nothing is subdivided and only other cells ask for some."""
     for word in {"full": ("full", "partial"), "partial": ("partial",)}.get(dilation, ()):
-        found = _voxels(outline, order.divided(0), word)
+        found = _voxels(order.outline, order.divided(0), word, elsewhere)
         if _count(found) <= room:
             return word, found
-    return "none", _voxels(outline, order.divided(0), "none")
+    return "none", _voxels(order.outline, order.divided(0), "none", elsewhere)
 
 
 def _voxels(
-    outline: Outline, divided: list[np.ndarray], dilation: str, asked: Sequence[np.ndarray] | None = None
+    outline: Outline,
+    divided: list[np.ndarray],
+    dilation: str,
+    elsewhere: list[np.ndarray],
+    asked: Sequence[np.ndarray] | None = None,
 ) -> list[np.ndarray]:
     """All voxels below the dense grid when some are subdivided."""
     solid = [outline.coords[0]]
@@ -248,8 +255,15 @@ def _voxels(
         solid.append(outline.coords[level + 1][mask[outline.parent[level + 1]]])
     for level in range(len(solid) - 1, 0, -1) if asked is not None else ():
         below = solid[level + 1] // BRANCH if level + 1 < len(solid) else solid[level][:0]
-        solid[level] = own(outline, level, np.concatenate([solid[level], asked[level], below]))
-    return dilate(outline, solid, dilation)
+        solid[level] = own(outline, level, np.concatenate([solid[level], _beside(solid[level], asked[level]), below]))
+    return dilate(outline, solid, dilation, elsewhere)
+
+
+def _beside(solid: np.ndarray, asked: np.ndarray) -> np.ndarray:
+    """Those of the voxels asked for that stand next to solid ones, or the cap would be theirs alone."""
+    near = neighbours(solid)
+    region = Region.around(np.concatenate([near, asked]))
+    return asked[np.isin(region.keys(asked), region.keys(near))]
 
 
 def _count(voxels: list[np.ndarray]) -> int:

@@ -20,13 +20,13 @@ from .grid import BRANCH, CELL_VOXELS
 from .outline import Outline
 from .region import Region
 
-__all__ = ["DILATIONS", "dilate", "neighbours", "own"]
+__all__ = ["DILATIONS", "dilate", "neighbours", "others", "own"]
 
 DILATIONS = ("none", "partial", "full")
 STEPS = list(itertools.product((-1, 0, 1), repeat=3))
 
 
-def dilate(outline: Outline, solid: list[np.ndarray], dilation: str) -> list[np.ndarray]:
+def dilate(outline: Outline, solid: list[np.ndarray], dilation: str, elsewhere: list[np.ndarray]) -> list[np.ndarray]:
     """Return all voxels of a cell.
 
     Parameters
@@ -37,6 +37,8 @@ def dilate(outline: Outline, solid: list[np.ndarray], dilation: str) -> list[np.
         For each level the solid voxels that the cell is to have; their parents are among them.
     dilation : str
         One of `DILATIONS`.
+    elsewhere : list of (b, 3) int64
+        From `others`.
 
     Returns
     -------
@@ -47,15 +49,43 @@ def dilate(outline: Outline, solid: list[np.ndarray], dilation: str) -> list[np.
     voxels = [solid[0][:0], *solid[1:]]
     if dilation == "none" or not finest:
         return voxels
-    others = _others(outline)
     if dilation == "full":
         inner = np.concatenate([_solid_only(outline, solid[finest]), outline.border[finest]])
         voxels[finest] = own(outline, finest, np.concatenate([solid[finest], neighbours(inner)]))
     for level in range(finest, 1, -1):
-        asked = _asked(voxels[level], others[level])
+        asked = _asked(voxels[level], elsewhere[level])
         asked = np.concatenate([asked, voxels[level] // BRANCH, solid[level - 1]])
         voxels[level - 1] = own(outline, level - 1, asked)
     return voxels
+
+
+def others(outline: Outline, dilation: str) -> list[np.ndarray]:
+    """Return voxels that other cells may have near the border, dilation included.
+
+    What they have depends on what they believe of this cell: all that geometry allows, not what it has.
+
+    Parameters
+    ----------
+    outline : Outline
+        The cell.
+    dilation : str
+        One of `DILATIONS`: theirs.
+
+    Returns
+    -------
+    list of (b, 3) int64
+        For each level those outside of the cell's columns.
+    """
+    finest = len(outline.border) - 1
+    possible = list(outline.around)
+    if dilation == "full":
+        possible[finest] = neighbours(outline.border[finest])
+    for level in range(finest, 2, -1) if dilation != "none" else ():
+        asked = _asked(possible[level][:0], possible[level])
+        possible[level - 1] = _once(np.concatenate([asked, possible[level] // BRANCH, possible[level - 1]]))
+    widths = [CELL_VOXELS * BRANCH**level for level in range(finest + 1)]
+    homes = [coords[:, :2] // width for coords, width in zip(possible, widths, strict=True)]
+    return [coords[(home != outline.cell).any(axis=1)] for coords, home in zip(possible, homes, strict=True)]
 
 
 def _solid_only(outline: Outline, voxels: np.ndarray) -> np.ndarray:
@@ -102,22 +132,6 @@ def neighbours(coords: np.ndarray) -> np.ndarray:
     bricks, near, _ = _near(coords[:0], coords)
     row, x, y, z = np.nonzero(near)
     return bricks[row] * BRANCH + np.stack([x, y, z], axis=-1)
-
-
-def _others(outline: Outline) -> list[np.ndarray]:
-    """Voxels of each level that other cells may have near the border, dilation included.
-
-    What they have depends on what they believe of this cell: all that geometry allows, not what it has. Voxels asked
-    for by themselves lie next to solid ones.
-    """
-    finest = len(outline.border) - 1
-    possible = [coords if level == 0 else neighbours(coords) for level, coords in enumerate(outline.border)]
-    for level in range(finest, 2, -1):
-        asked = _asked(possible[level][:0], possible[level])
-        possible[level - 1] = _once(np.concatenate([asked, possible[level] // BRANCH, possible[level - 1]]))
-    widths = [CELL_VOXELS * BRANCH**level for level in range(finest + 1)]
-    homes = [coords[:, :2] // width for coords, width in zip(possible, widths, strict=True)]
-    return [coords[(home != outline.cell).any(axis=1)] for coords, home in zip(possible, homes, strict=True)]
 
 
 def _once(coords: np.ndarray) -> np.ndarray:

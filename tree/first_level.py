@@ -17,7 +17,7 @@ from .need import Surfaces, bounds
 from .pairs import in_boxes, split, voxels_in
 from .region import Region
 
-__all__ = ["check", "dense_box", "occupied_cells", "solid_pairs", "surrounding", "without_undersides"]
+__all__ = ["around", "check", "dense_box", "occupied_cells", "solid_pairs", "surrounding", "without_undersides"]
 
 CORNERS = np.array(list(itertools.product((0, 1), repeat=3)), np.int64)
 
@@ -137,11 +137,33 @@ def surrounding(
     triangle, coords = pairs
     columns = np.asarray(cell) * CELL_VOXELS
     near = np.flatnonzero(((coords[:, :2] >= columns - 1) & (coords[:, :2] <= columns + CELL_VOXELS)).all(axis=1))
-    _, half = split(surfaces, triangle[near], coords[near], grid.first_size, 2)
+    voxels = around(surfaces, triangle[near], coords[near], grid.first_size)
+    return voxels[((voxels[:, :2] >= columns) & (voxels[:, :2] < columns + CELL_VOXELS)).all(axis=1)]
+
+
+def around(surfaces: Surfaces, triangle: np.ndarray, coords: np.ndarray, size: float) -> np.ndarray:
+    """Find the voxels whose centres surround geometry: those that a point on it is looked up from.
+
+    Parameters
+    ----------
+    surfaces : Surfaces
+        Triangles.
+    triangle : (p,) int64
+        Triangle of each pair.
+    coords : (p, 3) int64
+        Voxel of each pair; what lies of the triangle in other voxels does not count.
+    size : float
+        Size of the voxels [m].
+
+    Returns
+    -------
+    (m, 3) int64
+        Voxels, each once.
+    """
+    _, half = split(surfaces, triangle, coords, size, 2)
     half = Region.around(half).unique(half)
     voxels = ((half - 1 >> 1)[:, None] + CORNERS).reshape(-1, 3)
-    voxels = Region.around(voxels).unique(voxels)
-    return voxels[((voxels[:, :2] >= columns) & (voxels[:, :2] < columns + CELL_VOXELS)).all(axis=1)]
+    return Region.around(voxels).unique(voxels)
 
 
 def without_undersides(

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from . import bits
-from .first_level import check, dense_box, solid_pairs, surrounding, without_undersides
+from .first_level import around, check, dense_box, solid_pairs, surrounding, without_undersides
 from .grid import BRANCH, CELL_VOXELS, Grid
 from .need import FLAT, Surfaces, Voxels, assess, bounds, surfaces_of
 from .pairs import split
@@ -27,6 +27,9 @@ CANDIDATES = 4
 """An outline lists at most this many times the cap of voxels, so that a choice is left and memory is bounded."""
 LEAST = 1e-6
 """Need of a voxel that geometry asks to subdivide, however little it varies."""
+SMOOTH = 0.03
+"""Need up to which voxels at a border are no candidates of light: it hardly ever asks for them, and a neighbour would
+have to surround all that they may have."""
 REACH = 4
 """Voxels of a level that lie farther from a voxel of the level above it, in their own size, never ask for it."""
 
@@ -56,6 +59,9 @@ class Outline:
     border : tuple of (b, 3) int64
         Solid voxels on both sides of the cell's side borders that it or its neighbours may have, however they choose,
         as far as they matter to each other; none on the first level.
+    around : tuple of (a, 3) int64
+        Voxels whose centres surround the geometry in those of `border`, them included: no others near the border may
+        be asked for by themselves.
     left_out : int
         Voxels that geometry asked to subdivide, or to cover, and that are beyond what an outline lists.
     """
@@ -68,6 +74,7 @@ class Outline:
     wanted: tuple[np.ndarray, ...]
     need: tuple[np.ndarray, ...]
     border: tuple[np.ndarray, ...]
+    around: tuple[np.ndarray, ...]
     left_out: int = 0
 
     def cost(self, level: int) -> np.ndarray:
@@ -84,6 +91,25 @@ class Outline:
             Data points that its subdivision adds, dilation aside.
         """
         return np.bincount(self.parent[level + 1], minlength=len(self.coords[level]))
+
+    def foreseen(self, level: int, coords: np.ndarray) -> np.ndarray:
+        """Leave out voxels of the cell that would surprise its neighbours.
+
+        Parameters
+        ----------
+        level : int
+            Level of the voxels.
+        coords : (n, 3) int64
+            Voxels that somebody asks for.
+
+        Returns
+        -------
+        (m, 3) int64
+            Those in `around`, and those so far inside that they do not matter to other cells.
+        """
+        near = _in_band(coords, self.cell, level, _margins(self.grid.levels)[level] - 1)
+        known = Region.around(np.concatenate([self.around[level], coords]))
+        return coords[~near | np.isin(known.keys(coords), known.keys(self.around[level]))]
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +151,8 @@ def outline(
         Cap on the number of data points of the cell; it bounds the dense grid and the number of candidates.
     by_light : bool
         List flat voxels among the candidates too, with a need of 0, so that light may subdivide them; those whose
-        children are of the finest level excepted.
+        children are of the finest level excepted. Below the first level leave out those at a side border of the cell
+        that are flat, or nearly so.
 
     Returns
     -------
@@ -148,7 +175,8 @@ def outline(
     lost = ~first.own & _in_columns(first.voxels.coords, cell, 0)
     levels, wanted, need, left_out = _descend(surfaces, first, grid, cell, (flat, by_light), CANDIDATES * max_points)
     number = tuple(int(n) for n in cell)
-    return _collect(grid, number, dense, levels, wanted, need, left_out + int(lost.sum()))
+    borders = _borders(surfaces, grid, cell, levels)
+    return _collect(grid, number, dense, levels, (wanted, need), borders, left_out + int(lost.sum()))
 
 
 def _margins(levels: int) -> list[int]:
@@ -195,8 +223,8 @@ def _descend(
     for level in range(grid.levels - 1):
         here = levels[-1]
         varied, spread = assess(surfaces, here.voxels, rule[0])
-        listed = varied | (rule[1] and level < grid.levels - 2)
         varied_need = np.where(varied, np.maximum(spread, LEAST), 0.0)
+        listed = _for_light(here.voxels.coords, varied_need, level, grid) if rule[1] else varied
         band = cell, level + 1, margins[level + 1]
         children, refused = _children(surfaces, here, listed, varied_need, budget, band)
         budget -= int(children.own.sum())
@@ -205,6 +233,13 @@ def _descend(
         wanted.append(listed & ~refused)
         need.append(varied_need)
     return levels, wanted, need, left_out
+
+
+def _for_light(coords: np.ndarray, need: np.ndarray, level: int, grid: Grid) -> np.ndarray:
+    """Which voxels of a level light may subdivide, by what geometry needs."""
+    place, last = coords[:, :2] % (CELL_VOXELS * BRANCH**level), CELL_VOXELS * BRANCH**level - 1
+    outermost = ((place == 0) | (place == last)).any(axis=1) & (level > 0)
+    return np.where(outermost, need > SMOOTH, (need > 0) | (level < grid.levels - 2))
 
 
 def _children(
@@ -272,24 +307,36 @@ def _in_columns(coords: np.ndarray, cell: tuple[int, int], level: int, margin: i
     return x & y
 
 
+def _borders(
+    surfaces: Surfaces, grid: Grid, cell: tuple[int, int], levels: list[_Level]
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Solid voxels near the cell's side borders, and the voxels around the geometry in them."""
+    border, near = [], []
+    for number, (level, margin) in enumerate(zip(levels, _margins(grid.levels), strict=True)):
+        voxels = level.voxels
+        kept = _in_band(voxels.coords, cell, number, margin) & (number > 0)
+        pair = np.flatnonzero(kept[voxels.row])
+        border.append(voxels.coords[kept])
+        near.append(around(surfaces, voxels.triangle[pair], voxels.coords[voxels.row[pair]], voxels.size))
+    return border, near
+
+
 def _collect(
     grid: Grid,
     cell: tuple[int, int],
     dense: Region,
     levels: list[_Level],
-    wanted: list[np.ndarray],
-    need: list[np.ndarray],
+    asking: tuple[list[np.ndarray], list[np.ndarray]],
+    borders: tuple[list[np.ndarray], list[np.ndarray]],
     left_out: int,
 ) -> Outline:
-    """Keep the cell's own voxels, and of others the coordinates."""
-    coords, parent, border, margins = [], [], [], _margins(grid.levels)
+    """Keep the cell's own voxels, and of others what is near its borders."""
+    coords, parent = [], []
     rank = np.zeros(0, np.int64)
     for number, level in enumerate(levels):
-        found = level.voxels.coords
-        coords.append(found[level.own])
+        coords.append(level.voxels.coords[level.own])
         parent.append(rank[level.parent[level.own]] if number else level.parent[level.own])
-        border.append(found[_in_band(found, cell, number, margins[number])] if number else found[:0])
         rank = np.cumsum(level.own) - 1
     own = [level.own for level in levels]
-    kept = [tuple(values[rows] for values, rows in zip(part, own[:-1], strict=True)) for part in (wanted, need)]
-    return Outline(grid, cell, dense, tuple(coords), tuple(parent), *kept, tuple(border), left_out)
+    wanted, need = (tuple(values[rows] for values, rows in zip(part, own[:-1], strict=True)) for part in asking)
+    return Outline(grid, cell, dense, tuple(coords), tuple(parent), wanted, need, *map(tuple, borders), left_out)

@@ -6,13 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gi_volumes.tree import build, validate
+from gi_volumes.tree import boxes, build, validate
 from gi_volumes.tree.dilate import DILATIONS
 from gi_volumes.tree.grid import Grid
 from gi_volumes.tree.lookup import Atlas
-from gi_volumes.tree.outline import outline
+from gi_volumes.tree.outline import Outline, outline
 
 sys.path.insert(0, str(Path(__file__).parent))
+import bakes
 import meshes
 from definition import CORNERS, Definition, one_or_two_levels, probes
 
@@ -47,20 +48,21 @@ OF_ONE_CELL = {
 }
 
 
-def outlines(name):
+def outlines(name, by_light=False):
     """Outlines of all cells, each made alone, and the lattice."""
     triangles, levels, flat = (SCENES | OF_ONE_CELL)[name]
     triangles, grid = triangles(), Grid(levels=levels)
-    return [outline(triangles, grid, tuple(cell), flat) for cell in build.occupied_cells(triangles, grid)], grid
+    cells = [tuple(cell) for cell in build.occupied_cells(triangles, grid)]
+    return [outline(triangles, grid, cell, flat, by_light=by_light) for cell in cells], grid
 
 
 def field(points):
     return points @ np.array([0.3, -0.7, 0.2]) + 0.1
 
 
-def grown(name, dilation="partial", seed=None):
+def grown(name, dilation="partial", seed=None, by_light=False):
     """Trees of all cells; with a seed each cell subdivides a random half of its candidates."""
-    found, grid = outlines(name)
+    found, grid = outlines(name, by_light)
     trees = []
     for number, one in enumerate(found):
         rng = np.random.default_rng(None if seed is None else [seed, number])
@@ -88,6 +90,25 @@ def test_every_neighbourhood_has_data_of_one_or_two_levels(name, dilation, seed)
     bits = levels_used(trees, grid)
     assert one_or_two_levels(bits).all()
     assert (bits >= 1 << (grid.levels - 1)).any()
+
+
+@pytest.mark.parametrize("name", ["soup", "town", "four levels"])
+@pytest.mark.parametrize("seed", [None, 0])
+def test_candidates_of_light_have_such_neighbourhoods_too(name, seed):
+    trees, grid = grown(name, "partial", seed, by_light=True)
+    assert one_or_two_levels(levels_used(trees, grid)).all()
+
+
+def test_an_open_field_that_light_leaves_whole_costs_its_first_level_alone():
+    """Whatever light could ask for: no cell expects its neighbours to subdivide what is flat at their border."""
+    triangles, grid = meshes.ground(200.0, 0.3), Grid(levels=4)
+    found = outline(triangles, grid, (0, 0), by_light=True)
+    assert found.wanted[0].all()
+    outermost = ((found.coords[1][:, :2] == 0) | (found.coords[1][:, :2] == 63)).any(axis=1)
+    assert len(outermost) > 4000
+    np.testing.assert_array_equal(found.wanted[1], ~outermost)
+    tree = build.fit(found, [np.zeros(len(mask)) for mask in found.wanted])
+    assert tree.size == tree.grid_count
 
 
 @pytest.mark.parametrize("name", [name for name, (_, levels, _) in SCENES.items() if levels > 2])
@@ -142,7 +163,8 @@ def test_no_voxel_that_dilation_adds_can_be_left_out(monkeypatch):
 def test_without_its_neighbours_a_cell_would_not_fit_to_them(name):
     """A planted error: cells that know nothing of each other."""
     found, grid = outlines(name)
-    alone = [build.grow(replace(one, border=tuple(coords[:0] for coords in one.border))) for one in found]
+    nothing = tuple(coords[:0] for coords in found[0].border)
+    alone = [build.grow(replace(one, border=nothing, around=nothing)) for one in found]
     assert not one_or_two_levels(levels_used(alone, grid)).all()
 
 
@@ -269,3 +291,64 @@ def test_cells_know_all_voxels_that_their_neighbours_have_near_the_border():
             coords = found[other].coords[2]
             near = ((coords[:, :2] >= start - 4) & (coords[:, :2] < start + 260)).all(axis=1)
             assert set(map(tuple, coords[near].tolist())) <= known
+
+
+def edge(grid, level, reach):
+    """(n, 3) voxels of a level on both sides of the plane x = 0, so many on each, around the origin."""
+    size, far = grid.voxel_size(level), 26.0
+    y, z = np.arange(-int(far / size), int(far / size)), np.arange(-int(far / size), int(far / size))
+    return np.stack(np.meshgrid(np.arange(-reach, reach), y, z, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+@pytest.mark.parametrize(("level", "reach"), [(1, 1), (2, 3)])
+def test_cells_foresee_just_the_voxels_whose_centres_surround_geometry(level, reach):
+    """By brute force: a triangle overlaps the cube between the centres of a voxel's neighbours, touching included."""
+    triangles, grid = SCENES["soup"][0](), Grid()
+    rng, asked = np.random.default_rng(0), edge(grid, level, reach)
+    asked = rng.permutation(asked)[:20_000]
+    surrounds, size = np.zeros(len(asked), bool), grid.voxel_size(level)
+    for triangle in triangles.astype(np.float64):
+        surrounds |= boxes.overlap(np.repeat(triangle[None], len(asked), axis=0), (asked + 0.5) * size, size)
+    assert 20 < surrounds.sum() < len(asked) / 2
+    for cell in [(-1, -1), (-1, 0), (0, -1), (0, 0)]:
+        found, own = outline(triangles, grid, cell, ALL), (asked[:, :2] >= 0) == (np.array(cell) == 0)
+        own = own.all(axis=1)
+        kept = set(map(tuple, found.foreseen(level, asked[own]).tolist()))
+        assert kept == set(map(tuple, asked[own & surrounds].tolist()))
+        known = set(map(tuple, found.around[level].tolist()))
+        beside = own | ((asked[:, 1] >= 0) == (cell[1] == 0))
+        assert set(map(tuple, asked[beside & surrounds].tolist())) <= known
+
+
+def test_voxels_far_from_a_border_may_be_asked_for_anywhere():
+    triangles, grid = SCENES["soup"][0](), Grid()
+    found, deep = outline(triangles, grid, (0, 0)), np.array([[9, 9, 5], [40, 3, 30], [13, 33, -9]])
+    np.testing.assert_array_equal(found.foreseen(2, deep), deep)
+
+
+@pytest.mark.parametrize("name", ["room", "soup"])
+def test_voxels_that_other_cells_do_not_foresee_would_not_fit_to_theirs(monkeypatch, name):
+    """A planted error: what is asked for near a border is there, whatever the neighbours know."""
+    trees, grid = bakes.grown(name)
+    assert one_or_two_levels(levels_used(trees, grid)).all()
+    monkeypatch.setattr(Outline, "foreseen", lambda outline, level, coords: coords)
+    trees, grid = bakes.grown.__wrapped__(name)
+    assert not one_or_two_levels(levels_used(trees, grid)).all()
+
+
+@pytest.mark.parametrize("cap", [500, 800, 2000])
+def test_voxels_asked_for_come_with_the_solid_ones_beside_them_and_share_the_cap(cap):
+    """However many are asked for: were all of them there first, nothing could be subdivided."""
+    triangles, grid = SCENES["soup"][0](), Grid()
+    found, rng = outline(triangles, grid, (0, 0)), np.random.default_rng(0)
+    need = [rng.random(len(mask)) for mask in found.wanted]
+    asked = [np.unique((coords[:, None] + STEPS).reshape(-1, 3), axis=0) for coords in found.coords]
+    assert len(asked[2]) > 2000
+    tree = build.fit(found, need, max_points=cap, asked=asked)
+    assert 0.6 * cap < tree.size <= cap
+    level, coords = tree.voxels()
+    solid = set(map(tuple, found.coords[2].tolist()))
+    finest = set(map(tuple, coords[level == 2].tolist()))
+    assert len(finest & solid) > 0.1 * cap
+    for voxel in finest - solid:
+        assert any(tuple(near) in finest & solid for near in (np.array(voxel) + STEPS).tolist())
