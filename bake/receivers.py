@@ -53,6 +53,9 @@ TINY = 1e-3
 DOWN = -0.5
 """Normals below this vertical component face down: those of slopes up to 60 degrees."""
 
+GROUNDED = 0.5
+"""Part of the feelers of a back that faces down that must meet something: cellars stick out below a ground, too."""
+
 WITNESSES = 4
 """Feelers of a back side whose ends are judged in their turn."""
 
@@ -395,12 +398,12 @@ def _on_triangle(corners: np.ndarray, bits: np.ndarray) -> np.ndarray:
 def _is_free(scene: Scene, receivers: Receivers, crack: float) -> np.ndarray:
     """(n,) whether a side sees free space: few backs of opaque faces, and not only what lies against it.
 
-    The underside of a ground is not free: it is a back that faces down, and there is nothing below. A back side among
+    The underside of a ground is not free: it is a back that faces down, with hardly anything below. A back side among
     fronts is free only where most of these are: nobody is inside a closed wall that furniture sticks into.
     """
     direction, hits, met = _feel(scene, lifted(scene, receivers), receivers.normal.T, receivers.key)
     free = _has_space(hits, direction, met, crack)
-    free &= (hits.triangle != MISS).reshape(-1, FEELERS).any(axis=1) | ~_face_down(receivers)
+    free &= ((hits.triangle != MISS).reshape(-1, FEELERS).mean(axis=1) >= GROUNDED) | ~_face_down(receivers)
     back = np.flatnonzero(free & ~receivers.front)
     lane = (back[:, None] * FEELERS + np.arange(0, FEELERS, FEELERS // WITNESSES)).reshape(-1)
     lane = lane[met[lane] & (warp.dot(hits.normal[:, lane], direction[:, lane]) < 0)]
