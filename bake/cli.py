@@ -180,7 +180,7 @@ def _add_bake(commands) -> None:
     text = "most bytes of a world cell, such as 500k or 2M: what buys least is left coarse"
     command.add_argument("--max-bytes", type=_bytes, default=0, help=text)
     command.add_argument("--no-fit", action="store_true", help="keep data points as traced, not fitted to surfaces")
-    text = "full gives surfaces data of the finest voxels alone: faster to look up, about twice the data"
+    text = "full gives surfaces data of the finest voxels alone: two to five times the data"
     command.add_argument("--dilation", choices=("partial", "full"), default="partial", help=text)
     command.add_argument("--cells", type=_cells, help="only these world cells: 0,1/3,2")
     _add_light(command)

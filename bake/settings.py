@@ -55,7 +55,7 @@ class Settings:
     sky : "scene", "harmonics", or three numbers with commas: the radiance of a uniform sky
     sun : "scene", "none", "hemisphere", "arc:FILE", or a direction to the sun as x,y,z
     finest : size of the finest voxels [m]; 0 chooses it for the scene
-    dilation : "partial", or "full": surfaces have data of the finest level alone, for about twice the size
+    dilation : "partial", or "full": surfaces have data of the finest level alone, for two to five times the size
     seed : another seed gives independent noise
     error : relative error of surface irradiance above which a voxel is subdivided; 0: wherever geometry is not flat
     max_points, max_bytes : most data points and bytes of a world cell; 0 bytes for no limit

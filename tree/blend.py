@@ -15,7 +15,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from .interpolate import PAIRS, DataPoints, filled, last_resort, layers
+from .interpolate import PAIRS, DataPoints, last_resort, layers
 from .stencil import Taps, in_order, pick
 
 __all__ = ["ENOUGH", "blend", "clamp"]
@@ -59,7 +59,7 @@ def blend(data: DataPoints, values: np.ndarray, points: np.ndarray, normals: np.
         left = (np.maximum(ENOUGH - total, 0) / np.float32(ENOUGH)) ** (level - start + 1)
         _add(result, values, found, some, pick(share, some) * (1 - left) / np.where(total > 0, total, 1))
         due[some] = np.where(left > 0, start - 1, DONE)
-        share[some] *= _held_back(data, points, some, left, start)
+        share[some] *= _hold_back(data, found, start, left)
     some = np.flatnonzero(due > DONE)
     _add(result, values, last_resort(data, pick(points, some)), some, share[some])
     return result
@@ -105,11 +105,13 @@ def _trust(found: list[Taps], count: int) -> tuple[np.ndarray, np.ndarray]:
     return total, start
 
 
-def _held_back(data: DataPoints, points: np.ndarray, some: np.ndarray, left: np.ndarray, start: np.ndarray):
-    """(m,) what is left for coarser levels after voxels have held back theirs."""
-    for level in np.unique(start) if data.dims else ():
-        rows = np.flatnonzero((start == level) & (left > 0))
-        left[rows] *= filled(data, np.take(points, some[rows], axis=1), int(level))
+def _hold_back(data: DataPoints, found: list[Taps], start: np.ndarray, left: np.ndarray) -> np.ndarray:
+    """(m,) what is left for coarser levels after the voxels of the finest level have held back theirs."""
+    for taps in found if data.holds_back is not None else ():
+        rows = np.flatnonzero((left.take(taps.point) > 0) & (start.take(taps.point) == taps.level))
+        held = data.holds_back.take(pick(taps.row, rows))
+        held *= pick(taps.linear, rows)
+        left[taps.point[rows]] *= np.maximum(1 - in_order(held), 0)
     return left
 
 

@@ -11,7 +11,7 @@ and irradiance is the mean by these weights. Where they sum to too little, coars
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -23,7 +23,7 @@ from .lookup import Atlas
 from .stencil import Taps, in_order, pick, taps
 from .topology import Topology
 
-__all__ = ["PLANES", "DataPoints", "filled", "join", "last_resort", "layers", "weigh"]
+__all__ = ["PLANES", "DataPoints", "join", "last_resort", "layers", "weigh"]
 
 PLANES = 3
 """Occluding planes of a data point."""
@@ -105,9 +105,9 @@ class DataPoints:
         return (self.planes >= 0).any(axis=1)
 
     @cached_property
-    def dims(self) -> bool:
-        """Whether any voxel holds back light that coarser levels fill up."""
-        return bool((self.fill < 1).any())
+    def holds_back(self) -> np.ndarray | None:
+        """(n,) float32 what each voxel holds back of what fills up, or None where all hold back nothing."""
+        return 1 - self.fill if (self.fill < 1).any() else None
 
     @cached_property
     def first_level(self) -> np.ndarray:
@@ -216,34 +216,12 @@ def layers(data: DataPoints, points: np.ndarray, normals: np.ndarray, finest: in
     start = data.grid.levels - 1 if finest is None else finest
     for found in taps(data.grid, data.dual_cells, points, start):
         weight = found.weight
+        if data.holds_back is not None:
+            found = replace(found, linear=weight.copy())
         weight *= data.valid[found.row]
         _face(data, found, pick(normals, found.point))
         _occlude(data, found, points)
         yield found
-
-
-def filled(data: DataPoints, points: np.ndarray, level: int) -> np.ndarray:
-    """Say what counts of coarser levels where they fill up.
-
-    Parameters
-    ----------
-    data : DataPoints
-        The bake.
-    points : (3, n) float64
-        Relative to the origin [m].
-    level : int
-        The finest level around the points.
-
-    Returns
-    -------
-    (n,) float32
-        1 less what the voxels around hold back, by their linear weights; 0 to 1, and 1 where the level has none.
-    """
-    left = np.ones(points.shape[1], np.float32)
-    for found in taps(data.grid, data.dual_cells, points, level) if data.dims else ():
-        if found.level == level:
-            left[found.point] -= in_order(found.weight * (1 - data.fill.take(found.row)))
-    return np.maximum(left, 0)
 
 
 def last_resort(data: DataPoints, points: np.ndarray) -> Iterator[Taps]:

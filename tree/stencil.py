@@ -45,6 +45,8 @@ class Taps:
         The point, relative to the centre of the first corner [voxels of the level].
     level : int
         The level.
+    linear : (8, m) float32, optional
+        The linear weights alone, where `weight` is more than that.
     """
 
     point: np.ndarray
@@ -52,6 +54,7 @@ class Taps:
     weight: np.ndarray
     place: np.ndarray
     level: int
+    linear: np.ndarray | None = None
 
 
 def taps(grid: Grid, levels: list[DualCells], points: np.ndarray, finest: int) -> Iterator[Taps]:
