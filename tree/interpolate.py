@@ -100,6 +100,11 @@ class DataPoints:
         return np.ascontiguousarray(self.offset.T.astype(np.float32) / np.float32(OFFSET_STEPS))
 
     @cached_property
+    def columns(self) -> np.ndarray:
+        """(5, m) float64 planes by column."""
+        return np.ascontiguousarray(self.plane.T)
+
+    @cached_property
     def has_planes(self) -> np.ndarray:
         """(n,) bool."""
         return (self.planes >= 0).any(axis=1)
@@ -306,14 +311,18 @@ def _occlude(data: DataPoints, found: Taps, points: np.ndarray) -> None:
     flat = np.flatnonzero(data.has_planes.take(found.row) & (found.weight > 0))
     if not len(flat):
         return
-    planes = data.planes.take(found.row.reshape(-1)[flat], axis=0)
+    planes = data.planes.take(found.row.reshape(-1).take(flat), axis=0)
     at = points.take(found.point.take(flat % len(found.point)), axis=1)
     seen = np.ones(len(flat))
-    for number in range(PLANES):
-        some = np.flatnonzero(planes[:, number] >= 0)
-        plane = data.plane[planes[some, number]].T
-        behind = sum(plane[axis] * at[axis, some] for axis in range(3)) - plane[3]
-        seen[some] *= np.clip(1.0 + behind / plane[4], 0.0, 1.0)
+    for column in np.ascontiguousarray(planes.T):
+        some = np.flatnonzero(column >= 0)
+        if len(some):
+            row = column.take(some)
+            behind = sum(data.columns[axis].take(row) * at[axis].take(some) for axis in range(3))
+            behind -= data.columns[3].take(row)
+            behind /= data.columns[4].take(row)
+            behind += 1.0
+            seen[some] *= np.clip(behind, 0.0, 1.0, out=behind)
     found.weight.reshape(-1)[flat] *= seen.astype(np.float32)
 
 
