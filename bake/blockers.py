@@ -6,6 +6,7 @@ data point the few that stand before the most of what it must not light.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,9 @@ CANDIDATES = 16
 
 BLOCK = 8
 """Coplanar triangles are merged within blocks of this many finest voxels: farther apart, rounding tilts them."""
+
+PAIRS = 1 << 20
+"""Pairs whose blockers are looked at together: about 100 MB."""
 
 SAME = 4e-4
 """Two planes are the same when their normals, and their distances in finest voxels, round to the same multiple."""
@@ -72,14 +76,33 @@ def find(scene: Scene, pairs: Pairs, weight: np.ndarray, position: np.ndarray, f
         At most `CANDIDATES` a data point; none that a data point lies on.
     """
     hidden = np.flatnonzero(~pairs.visible)
-    triangle, place = np.unique(pairs.blocker[hidden], return_inverse=True)
+    triangle = np.unique(pairs.blocker[hidden])
     planes, plane = _merge(scene.soup.corners[triangle].astype(np.float64), finest)
-    plane = plane[place.reshape(-1, 2)]
-    both = plane[:, 1] != plane[:, 0]
-    point = np.concatenate([pairs.point[hidden], pairs.point[hidden][both]]).astype(np.int64)
-    code = point * max(len(planes), 1) + np.concatenate([plane[:, 0], plane[both, 1]])
+    found = [Candidates(np.zeros(0, np.int64), planes[:0])]
+    for rows in _tiles(pairs.point[hidden]):
+        part = pairs.take(hidden[rows])
+        before = plane[np.searchsorted(triangle, part.blocker)]
+        found.append(_best((planes, before), part.point, weight[hidden[rows]], position, finest))
+    return Candidates(np.concatenate([part.point for part in found]), np.concatenate([part.plane for part in found]))
+
+
+def _tiles(point: np.ndarray) -> list[slice]:
+    """Rows of some data points each, about as many as are looked at together, of ascending data points."""
+    ends = np.searchsorted(point, point[PAIRS::PAIRS])
+    ends = np.unique(np.concatenate([[0], ends, [len(point)]])).tolist()
+    return [slice(start, end) for start, end in itertools.pairwise(ends)]
+
+
+def _best(
+    blocking: tuple[np.ndarray, np.ndarray], point: np.ndarray, weight: np.ndarray, position: np.ndarray, finest: float
+) -> Candidates:
+    """Candidates of data points, from all planes and the two that stand before each of their hidden pairs."""
+    planes, before = blocking
+    both = before[:, 1] != before[:, 0]
+    point = np.concatenate([point, point[both]]).astype(np.int64)
+    code = point * max(len(planes), 1) + np.concatenate([before[:, 0], before[both, 1]])
     code, place = np.unique(code, return_inverse=True)
-    sums = np.bincount(place.reshape(-1), np.concatenate([weight[hidden], weight[hidden][both]]), len(code))
+    sums = np.bincount(place.reshape(-1), np.concatenate([weight, weight[both]]), len(code))
     point, row = np.divmod(code, max(len(planes), 1))
     height = (planes[row, :3] * position[point]).sum(axis=1) - planes[row, 3]
     order = np.lexsort((-sums, point))

@@ -149,7 +149,7 @@ class _Task:
 
     def __init__(self, scene: Scene, data: interpolate.DataPoints, receivers: Receivers, pairs: Pairs) -> None:
         self.pairs, self.data, self.place = pairs, data, receivers.position
-        self.weight, self.visible = pairs.weight.astype(np.float64), pairs.visible
+        self.weight, self.visible = pairs.weight, pairs.visible
         self.lit = np.bincount(pairs.receiver, self.weight * self.visible, len(self.place))
         self.own = _within(data.boxes, self.place)
         self.value = self._values(receivers.area.astype(np.float64))
@@ -246,7 +246,8 @@ class _Task:
         planes[used] = row.reshape(-1)
         planes = np.take_along_axis(planes, np.argsort(~used, axis=1, kind="stable"), axis=1)
         left = self.weight * self.passed(slots, np.arange(len(self.weight)))
-        kept = [float(left[of].sum() / max(self.weight[of].sum(), 1e-30)) for of in (self.visible, ~self.visible)]
+        whole = self.weight.astype(np.float64)
+        kept = [float(left[of].sum() / max(whole[of].sum(), 1e-30)) for of in (self.visible, ~self.visible)]
         return Occluders(planes, table, self.lit <= FAINT, *kept)
 
 

@@ -7,8 +7,6 @@ half-size voxel that holds the point, and may lie beyond the border of the cell 
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 
 from . import boxes
@@ -19,7 +17,8 @@ from .region import Region
 
 __all__ = ["around", "check", "dense_box", "occupied_cells", "solid_pairs", "surrounding", "without_undersides"]
 
-CORNERS = np.array(list(itertools.product((0, 1), repeat=3)), np.int64)
+PAIRS = 1 << 17
+"""Triangles in voxels that are looked at together: about 100 MB."""
 
 
 def check(triangles: np.ndarray) -> np.ndarray:
@@ -160,10 +159,17 @@ def around(surfaces: Surfaces, triangle: np.ndarray, coords: np.ndarray, size: f
     (m, 3) int64
         Voxels, each once.
     """
-    _, half = split(surfaces, triangle, coords, size, 2)
-    half = Region.around(half).unique(half)
-    voxels = ((half - 1 >> 1)[:, None] + CORNERS).reshape(-1, 3)
-    return Region.around(voxels).unique(voxels)
+    found = [np.zeros((0, 3), np.int64)]
+    for start in range(0, len(triangle), PAIRS):
+        part = slice(start, start + PAIRS)
+        _, half = split(surfaces, triangle[part], coords[part], size, 2)
+        base = half - 1 >> 1
+        found.append(Region.around(base).unique(base))
+    voxels = np.concatenate(found)
+    for step in np.eye(3, dtype=np.int64):
+        voxels = np.concatenate([voxels, voxels + step])
+        voxels = Region.around(voxels).unique(voxels)
+    return voxels
 
 
 def without_undersides(

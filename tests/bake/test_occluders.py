@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import build_scenes
 import numpy as np
 import pytest
-from gi_volumes.bake import datapoints, halfspaces, occluders
+from gi_volumes.bake import blockers, datapoints, halfspaces, occluders
 from gi_volumes.bake.occluders import Occluders, fit
 from gi_volumes.bake.rays import MISS
 from gi_volumes.bake.receivers import Receivers, spread
@@ -260,6 +260,8 @@ def test_tiles_do_not_change_the_planes(monkeypatch):
     data, receivers = data_of(scene), around(scene, 0.3)
     whole = fit(scene, data, receivers)
     monkeypatch.setattr(occluders, "CHUNK", 1 << 14)
+    monkeypatch.setattr(occluders, "PASSED", 1 << 10)
+    monkeypatch.setattr(blockers, "PAIRS", 1 << 8)
     split = fit(scene, data, receivers)
     assert (whole.planes >= 0).sum() == (split.planes >= 0).sum()
     assert split.plane == pytest.approx(whole.plane, abs=1e-9)

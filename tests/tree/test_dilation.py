@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gi_volumes.tree import boxes, build, validate
+from gi_volumes.tree import boxes, build, first_level, validate
 from gi_volumes.tree.dilate import DILATIONS
 from gi_volumes.tree.grid import Grid
 from gi_volumes.tree.lookup import Atlas
@@ -318,6 +318,14 @@ def test_cells_foresee_just_the_voxels_whose_centres_surround_geometry(level, re
         known = set(map(tuple, found.around[level].tolist()))
         beside = own | ((asked[:, 1] >= 0) == (cell[1] == 0))
         assert set(map(tuple, asked[beside & surrounds].tolist())) <= known
+
+
+def test_what_surrounds_geometry_does_not_depend_on_how_much_is_looked_at_together(monkeypatch):
+    triangles, grid = SCENES["town"][0](), Grid()
+    whole = outline(triangles, grid, (0, -1), ALL)
+    monkeypatch.setattr(first_level, "PAIRS", 97)
+    for one, other in zip(whole.around, outline(triangles, grid, (0, -1), ALL).around, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_voxels_far_from_a_border_may_be_asked_for_anywhere():
