@@ -34,8 +34,8 @@ class DualCells:
 
     Attributes
     ----------
-    corners : (c, 8) int64
-        Rows of each dual cell's corners, -1 where the voxel does not exist; row 0 is -1 throughout.
+    corners : (8, c) int64
+        Rows of each dual cell's corners, -1 where the voxel does not exist; column 0 is -1 throughout.
     whole : (c,) bool
         Whether all corners exist.
     """
@@ -50,9 +50,9 @@ class DualCells:
             size = (int(number.max(initial=0)) + 1) * 64
             number, block = _number(number * 64 + _step(base.T, stage), size)
             self._blocks.append(block)
-        self.corners = np.full((int(number.max(initial=0)) + 1, 8), -1, np.int64)
-        self.corners[number.reshape(-1, 8), np.arange(8)] = rows[:, None]
-        self.whole = (self.corners >= 0).all(axis=1)
+        self.corners = np.full((8, int(number.max(initial=0)) + 1), -1, np.int64)
+        self.corners[np.arange(8), number.reshape(-1, 8)] = rows[:, None]
+        self.whole = (self.corners >= 0).all(axis=0)
 
     def find(self, base: np.ndarray) -> np.ndarray:
         """Return the number of dual cells.
@@ -65,11 +65,11 @@ class DualCells:
         Returns
         -------
         (n,) int64
-            Row of `corners`; 0 where no corner exists.
+            Column of `corners`; 0 where no corner exists.
         """
-        number = self._root.take(self._root_key(base))
+        number = self._root.take(self._root_key(base), mode="clip")
         for stage, block in zip(range(self._depth - 1, -1, -1), self._blocks, strict=True):
-            number = block.take((number << 6) + _step(base, stage))
+            number = block.take((number << 6) + _step(base, stage), mode="clip")
         return number
 
     def _root_key(self, base: np.ndarray) -> np.ndarray:

@@ -48,9 +48,12 @@ def basis(directions: np.ndarray) -> np.ndarray:
     Source: Ramamoorthi and Hanrahan 2001, "An Efficient Representation for Irradiance Environment Maps", eq. 3.
     """
     x, y, z = np.moveaxis(np.asarray(directions, np.float64), -1, 0)
-    columns = [np.full_like(x, _A), _B * y, _B * z, _B * x]
+    columns = [_A, _B * y, _B * z, _B * x]
     columns += [_C * x * y, _C * y * z, _D * (3.0 * z * z - 1.0), _C * x * z, _E * (x * x - y * y)]
-    return np.stack(columns, axis=-1).astype(np.float32)
+    values = np.empty((*x.shape, COUNT), np.float32)
+    for term, column in enumerate(columns):
+        values[..., term] = column
+    return values
 
 
 def irradiance(coefficients: np.ndarray, normals: np.ndarray) -> np.ndarray:

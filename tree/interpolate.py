@@ -31,6 +31,8 @@ NEAR = 1e-3
 """Distance in voxel sizes within which the cosine fades to 1, as no direction exists at the data point itself."""
 ANY = np.float32(1e9)
 """Added height that makes every direction count alike."""
+COLUMNS = 1 << 13
+"""Points whose taps are weighed at a time, in arrays that stay in the processor's cache."""
 PAIRS = 1 << 22
 """Distances computed at a time."""
 
@@ -100,14 +102,24 @@ class DataPoints:
         return np.ascontiguousarray(self.offset.T.astype(np.float32) / np.float32(OFFSET_STEPS))
 
     @cached_property
-    def columns(self) -> np.ndarray:
-        """(5, m) float64 planes by column."""
-        return np.ascontiguousarray(self.plane.T)
-
-    @cached_property
     def has_planes(self) -> np.ndarray:
         """(n,) bool."""
         return (self.planes >= 0).any(axis=1)
+
+    @cached_property
+    def falloffs(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """What the first, second and third planes of the data points let through, as linear functions of the place.
+
+        For each: which column each data point has, 0 for none, and (4, columns) float64 slope and value at the origin.
+        In float64, as planes can be narrower than a ten-thousandth of a voxel.
+        """
+        found, planes = [], -np.sort(-self.planes, axis=1)
+        for column in planes.T:
+            used, row = np.unique(column, return_inverse=True)
+            plane = self.plane[used[used >= 0]].T
+            table = np.concatenate([plane[:3], plane[4:] - plane[3:4]]) / plane[4]
+            found.append((row.reshape(-1) + (used[0] >= 0 if len(used) else 0), np.pad(table, [(0, 0), (1, 0)])))
+        return found
 
     @cached_property
     def holds_back(self) -> np.ndarray | None:
@@ -220,12 +232,9 @@ def layers(data: DataPoints, points: np.ndarray, normals: np.ndarray, finest: in
     """
     start = data.grid.levels - 1 if finest is None else finest
     for found in taps(data.grid, data.dual_cells, points, start):
-        weight = found.weight
         if data.holds_back is not None:
-            found = replace(found, linear=weight.copy())
-        weight *= data.valid[found.row]
-        _face(data, found, pick(normals, found.point))
-        _occlude(data, found, points)
+            found = replace(found, linear=found.weight.copy())
+        _trust(data, found, pick(normals, found.point))
         yield found
 
 
@@ -291,39 +300,50 @@ def weigh(data: DataPoints, points: np.ndarray, normals: np.ndarray) -> tuple[np
     return row, weight
 
 
-def _face(data: DataPoints, found: Taps, normals: np.ndarray) -> None:
-    """Multiply weights with the cosine between the normal and the way to the data point, 0 behind the surface."""
+def _trust(data: DataPoints, found: Taps, normals: np.ndarray) -> None:
+    """Multiply weights with the cosine between normal and way to the data point, and with what planes let through."""
     lift = np.where(normals.any(axis=0), np.float32(NEAR), ANY)
-    for corner, row in enumerate(found.row):
-        height, squared = lift.copy(), np.full(len(lift), NEAR * NEAR, np.float32)
+    for start in range(0, len(lift), COLUMNS):
+        part = slice(start, start + COLUMNS)
+        row = np.ascontiguousarray(found.row[:, part])
+        way = [data.shift[axis].take(row, mode="clip") for axis in range(3)]
         for axis in range(3):
-            arm = data.shift[axis].take(row)
-            arm -= found.place[axis] - np.float32(CORNERS[corner, axis])
-            height += normals[axis] * arm
-            arm *= arm
-            squared += arm
-        height /= np.sqrt(squared, out=squared)
-        found.weight[corner] *= np.clip(height, 0, 1, out=height)
+            way[axis] -= found.place[axis, part]
+            way[axis] += CORNERS[:, axis, None].astype(np.float32)
+        weight = found.weight[:, part] * data.valid.take(row, mode="clip")
+        weight *= _cosine(way, normals[:, part], lift[part])
+        _occlude(data, row, weight, found.at[:, part])
+        found.weight[:, part] = weight
 
 
-def _occlude(data: DataPoints, found: Taps, points: np.ndarray) -> None:
+def _cosine(way: list[np.ndarray], normals: np.ndarray, lift: np.ndarray) -> np.ndarray:
+    """(8, m) cosine between normals and ways, 0 behind the surface and about 1 where there is no way."""
+    height = normals[0] * way[0]
+    height += lift
+    squared = way[0] * way[0]
+    squared += np.float32(NEAR * NEAR)
+    for along, normal in zip(way[1:], normals[1:], strict=True):
+        height += normal * along
+        squared += along * along
+    height /= np.sqrt(squared, out=squared)
+    return np.clip(height, 0, 1, out=height)
+
+
+def _occlude(data: DataPoints, row: np.ndarray, weight: np.ndarray, points: np.ndarray) -> None:
     """Multiply weights with what the data points' planes let through."""
-    flat = np.flatnonzero(data.has_planes.take(found.row) & (found.weight > 0))
-    if not len(flat):
-        return
-    planes = data.planes.take(found.row.reshape(-1).take(flat), axis=0)
-    at = points.take(found.point.take(flat % len(found.point)), axis=1)
-    seen = np.ones(len(flat))
-    for column in np.ascontiguousarray(planes.T):
-        some = np.flatnonzero(column >= 0)
-        if len(some):
-            row = column.take(some)
-            behind = sum(data.columns[axis].take(row) * at[axis].take(some) for axis in range(3))
-            behind -= data.columns[3].take(row)
-            behind /= data.columns[4].take(row)
-            behind += 1.0
-            seen[some] *= np.clip(behind, 0.0, 1.0, out=behind)
-    found.weight.reshape(-1)[flat] *= seen.astype(np.float32)
+    some = np.flatnonzero(data.has_planes.take(row, mode="clip") & (weight > 0))
+    row, point, weight = row.take(some), np.tile(np.arange(weight.shape[1]), 8).take(some), weight.reshape(-1)
+    for number, (slot, falloff) in enumerate(data.falloffs):
+        column = slot.take(row, mode="clip")
+        if number:
+            used = np.flatnonzero(column > 0)
+            some, row, point, column = (part.take(used, mode="clip") for part in (some, row, point, column))
+        if not len(some):
+            return
+        passed = falloff[3].take(column, mode="clip")
+        for along, slope in zip(points, falloff, strict=False):
+            passed += along.take(point, mode="clip") * slope.take(column, mode="clip")
+        weight[some] *= np.clip(passed, 0, 1, out=passed)
 
 
 def _squared(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -41,8 +41,10 @@ class Taps:
         Rows of the data points, 0 where the weight is 0.
     weight : (8, m) float32
         Linear weights; over all levels they sum to 1 for each point, less what lies outside the first level.
+    at : (3, m) float64
+        The points [m].
     place : (3, m) float32
-        The point, relative to the centre of the first corner [voxels of the level].
+        The points, relative to the centre of the first corner [voxels of the level].
     level : int
         The level.
     linear : (8, m) float32, optional
@@ -52,6 +54,7 @@ class Taps:
     point: np.ndarray
     row: np.ndarray
     weight: np.ndarray
+    at: np.ndarray
     place: np.ndarray
     level: int
     linear: np.ndarray | None = None
@@ -88,7 +91,7 @@ def taps(grid: Grid, levels: list[DualCells], points: np.ndarray, finest: int) -
         place = center * (1.0 / size) - 0.5
         base = np.floor(place)
         number = levels[level].find(base.astype(np.int64))
-        goes_on, touched = number == 0, np.flatnonzero(number)
+        goes_on, touched = number == 0, np.flatnonzero(number > 0)
         if len(touched):
             corners = _corners(levels[level], place, base, share, number, touched)
             used, base = pick(point, touched), pick(base, touched)
@@ -96,7 +99,8 @@ def taps(grid: Grid, levels: list[DualCells], points: np.ndarray, finest: int) -
             some = touched[some]
             center[:, some], share[some], goes_on[some] = moved, missing, True
             row = np.maximum(corners[0], 0, out=corners[0])
-            yield Taps(used, row, corners[1], _place(points, used, base, size), level)
+            at = pick(points, used)
+            yield Taps(used, row, corners[1], at, _place(at, base, size), level)
         rest = np.flatnonzero(goes_on)
         if not level or not len(rest):
             return
@@ -137,13 +141,13 @@ def pick(values: np.ndarray, some: np.ndarray) -> np.ndarray:
     (..., m) ndarray
         Not a copy if it is all of them.
     """
-    return values if len(some) == values.shape[-1] else np.take(values, some, axis=-1)
+    return values if len(some) == values.shape[-1] else np.take(values, some, axis=-1, mode="clip")
 
 
 def _corners(cells: DualCells, place, base, share, number, touched: np.ndarray) -> tuple[np.ndarray, ...]:
     """(8, m) rows and linear weights of dual cells that have corners, and whether all of them exist."""
     number = pick(number, touched)
-    row = np.ascontiguousarray(np.take(cells.corners, number, axis=0).T)
+    row = np.take(cells.corners, number, axis=1, mode="clip")
     weight = _trilinear(pick(place - base, touched).astype(np.float32), pick(share, touched))
     return row, weight, cells.whole[number]
 
@@ -167,6 +171,9 @@ def _trilinear(place: np.ndarray, share: np.ndarray) -> np.ndarray:
     return (yz[:, :, None] * x).reshape(8, -1)
 
 
-def _place(points: np.ndarray, point: np.ndarray, base: np.ndarray, size: float) -> np.ndarray:
-    """Points relative to the centres of the first corners [voxels]."""
-    return (pick(points, point) * (1.0 / size) - 0.5 - base).astype(np.float32)
+def _place(at: np.ndarray, base: np.ndarray, size: float) -> np.ndarray:
+    """(3, m) float32 points relative to the centres of the first corners [voxels]."""
+    place = at * (1.0 / size)
+    place -= 0.5
+    place -= base
+    return place.astype(np.float32)

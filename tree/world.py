@@ -26,7 +26,9 @@ __all__ = ["TRANSPORTS", "World", "load"]
 TRANSPORTS = ("all", "local", "sun", "sky")
 FIXED_SUN = np.radians(1.0)
 """How far from a baked direction a fixed sun may be asked for [rad]: two disks of the sun."""
-CHUNK = 1 << 15
+LARGEST = np.finfo(np.float32).max / 100
+"""Limit of coefficients, so that no sum of them overflows."""
+CHUNK = 1 << 16
 """Points handled at a time: few enough for some 50 MB, so many that calls cost little."""
 REMEMBERED = 4
 """Combinations of transports, sun and sky whose coefficients are kept for the next look-up."""
@@ -112,24 +114,25 @@ class World:
         Error: bounded by what is stored; see `docs/accuracy.md`.
         Source: the talk's rows 9 and 10.
         """
-        points, normals = _check_rows(points, "points"), _unit(_check_rows(normals, "normals"))
+        points, normals = _check_rows(points, "points"), _check_rows(normals, "normals")
         if len(points) != len(normals):
             raise ValueError(f"{len(points)} points and {len(normals)} normals; as many are needed")
         values = self._folded(self._factors(sun, sky, transport))
         result = np.zeros((len(points), 3), np.float32)
-        for start in range(0, len(points), CHUNK):
+        for start in range(0, len(points) if values.size else 0, CHUNK):
             part = slice(start, start + CHUNK)
-            result[part] = self._evaluate(clamp(self._data, self.grid.to_local(points[part])), normals[part], values)
+            result[part] = self._evaluate(points[part], normals[part], values)
         return result
 
     def _evaluate(self, points: np.ndarray, normals: np.ndarray, values: np.ndarray) -> np.ndarray:
         """One chunk: the mean coefficients of all transports at once, then each along the normals."""
-        functions = harmonics.basis(normals).astype(np.float32)
-        functions[~normals.any(axis=1), 1:] = 0.0
+        points, normals = clamp(self._data, self.grid.to_local(points)), _unit(normals)
+        functions = harmonics.basis(normals)
+        functions[:, 6] *= np.any(normals.T, axis=0)  # of no direction; the others are 0 there, but the constant
         mean = blend(self._data, values, points, normals)
         total = np.zeros((len(points), 3), np.float32)
         for first in range(0, mean.shape[1], 27):
-            part = np.einsum("nh,nhc->nc", functions, mean[:, first : first + 27].reshape(-1, 9, 3))
+            part = np.matmul(functions[:, None], mean[:, first : first + 27].reshape(-1, 9, 3))[:, 0]
             total += np.maximum(part, 0.0, out=part)
         return np.minimum(total, np.finfo(np.float32).max)
 
@@ -140,7 +143,8 @@ class World:
             while len(self._remembered) >= REMEMBERED:
                 self._remembered.pop(next(iter(self._remembered)))
             parts = [self._values[name].folded(factor) for name, factor in factors.items()]
-            self._remembered[key] = np.concatenate([np.zeros((len(self._data.valid), 0), np.float32), *parts], axis=1)
+            folded = np.concatenate([np.zeros((len(self._data.valid), 0), np.float32), *parts], axis=1)
+            self._remembered[key] = np.clip(folded, -LARGEST, LARGEST, out=folded)
         return self._remembered[key]
 
     def _factors(self, sun: tuple | None, sky: np.ndarray | float | None, transport: str) -> dict[str, np.ndarray]:

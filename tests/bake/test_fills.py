@@ -77,7 +77,7 @@ def test_what_voxels_hold_back_is_the_bounded_least_squares_solution():
     row = rng.integers(0, voxels, (8, count))
     weight = rng.random((8, count)).astype(np.float32)
     weight /= weight.sum(axis=0)
-    found = Taps(np.arange(count), row, weight, np.zeros((3, count), np.float32), 0)
+    found = Taps(np.arange(count), row, weight, np.zeros((3, count)), np.zeros((3, count), np.float32), 0)
     target, matter = (weight * rng.random(voxels)[row]).sum(axis=0), rng.random(count)
     held = fills._solve(found, target, matter, voxels + 1)
     assert np.sqrt(np.mean((target - (weight * held[row]).sum(axis=0)) ** 2)) < 0.1 * np.sqrt(np.mean(target**2))

@@ -139,13 +139,13 @@ def test_the_bisection_finds_a_planted_step(monkeypatch):
     """A cosine that starts at 0.05 instead of 0, a plane without a ramp, no filling up."""
     data = bakes.rough("soup")
     values, segments = noise(data), short_segments(data, 2500)
-    weight = interpolate._face
+    trust = interpolate._trust
 
     def stepped(data, found, normals):
-        weight(data, found, normals)
+        trust(data, found, normals)
         found.weight[:] = np.where(found.weight > 0, found.weight + np.float32(0.05), 0)
 
-    monkeypatch.setattr(interpolate, "_face", stepped)
+    monkeypatch.setattr(interpolate, "_trust", stepped)
     assert along_segments(data, values, *segments)[1].max() > 4 * SMOOTH
     monkeypatch.undo()
     sharp = replace(data, plane=np.where(np.arange(5) == 4, 1e-12, data.plane))

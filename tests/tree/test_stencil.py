@@ -116,7 +116,7 @@ def test_dual_cells_are_those_of_a_dictionary(far, spread):
     known = {tuple(c): row for c, row in zip(coords.tolist(), rows.tolist(), strict=True)}
     cells = DualCells(coords, rows)
     asked = np.concatenate([coords[rng.integers(0, len(coords), 3000)] + rng.integers(-2, 3, (3000, 3)), coords * 3])
-    found = cells.corners[cells.find(np.ascontiguousarray(asked.T))]
+    found = cells.corners[:, cells.find(np.ascontiguousarray(asked.T))].T
     expected = [[known.get(tuple(c), -1) for c in (base + dualcells.CORNERS).tolist()] for base in asked]
     np.testing.assert_array_equal(found, expected)
 
