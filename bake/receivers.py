@@ -53,8 +53,9 @@ TINY = 1e-3
 DOWN = -0.5
 """Normals below this vertical component face down: those of slopes up to 60 degrees."""
 
-GROUNDED = 0.5
-"""Part of the feelers of a back that faces down that must meet something: cellars stick out below a ground, too."""
+GROUNDED = 1 / 8
+"""Part of the feelers of a back that faces down that must meet something: cellars stick out below a ground, too. With
+one feeler sealed rooms on a ground leaked 0.2 % of the light, with this 0.0005 %; floors of open storeys have more."""
 
 WITNESSES = 4
 """Feelers of a back side whose ends are judged in their turn."""

@@ -53,6 +53,8 @@ def blend(data: DataPoints, values: np.ndarray, points: np.ndarray, normals: np.
     points, normals = np.ascontiguousarray(points.T), np.ascontiguousarray(normals.T, np.float32)
     count = points.shape[1]
     result, share = np.zeros((count, values.shape[1]), np.float32), np.ones(count, np.float32)
+    if not values.size:
+        return result
     due = np.full(count, data.grid.levels - 1)
     for level in range(data.grid.levels - 1, -1, -1):
         some = np.flatnonzero(due == level)

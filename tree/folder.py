@@ -95,13 +95,15 @@ def load_header(folder: str | os.PathLike) -> dict:
         When it is missing or cannot be read.
     """
     path = Path(folder) / WORLD
+    if not Path(folder).is_dir():
+        raise FileNotFoundError(2, "no such folder", os.fspath(folder))
     if path.stat().st_size > MAX_WORLD_BYTES:
         raise FileError(path, 0, "the file is too long for a world.json")
     text = path.read_bytes()
     try:
         content = json.loads(text)
     except (ValueError, RecursionError) as error:
-        reason = " ".join(str(error).split())
+        reason = "it is no text" if isinstance(error, UnicodeDecodeError) else " ".join(str(error).split())
         raise FileError(path, getattr(error, "pos", 0), f"this is not JSON: {reason}") from None
     if not isinstance(content, dict) or content.get("format") != WORLD_FORMAT:
         raise FileError(path, 0, "this is not the world.json of a bake")

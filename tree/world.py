@@ -119,7 +119,7 @@ class World:
             raise ValueError(f"{len(points)} points and {len(normals)} normals; as many are needed")
         values = self._folded(self._factors(sun, sky, transport))
         result = np.zeros((len(points), 3), np.float32)
-        for start in range(0, len(points) if values.size else 0, CHUNK):
+        for start in range(0, len(points), CHUNK):
             part = slice(start, start + CHUNK)
             result[part] = self._evaluate(points[part], normals[part], values)
         return result

@@ -22,6 +22,9 @@ BAR = 1e-3
 OBLIQUE = 4
 """Times the bar that single points may reach where walls cut through voxels at an angle."""
 
+SHEET = 10
+"""The same for walls without thickness, half a millimetre beside which data points of the other room may stand."""
+
 POINTS = 3000
 
 
@@ -62,7 +65,7 @@ def test_a_wall_of_any_thickness_keeps_a_sealed_room_dark_wherever_it_stands(thi
     found = leak(leak_scenes.two_rooms(thickness, Pose(shift, turn)), tmp_path)
     assert found.mean() < BAR / 10
     assert np.quantile(found, 0.99) < BAR
-    assert found.max() < OBLIQUE * BAR
+    assert found.max() < (OBLIQUE if thickness else SHEET) * BAR
 
 
 @pytest.mark.slow

@@ -52,6 +52,10 @@ def blender(linked, run_python, tmp_path):
     return run
 
 
+SOURCES = ("LICENSE", "README.md", "__init__.py", "__main__.py", "bake", "blender_manifest.toml", "operators", "tree")
+PACKAGED = (".py", ".md", ".toml", "LICENSE")
+
+
 @pytest.fixture
 def built(repository, tmp_path):
     """The zip that `make package` makes."""
@@ -74,6 +78,19 @@ def test_blenders_tool_builds_and_validates_a_zip_of_the_package_and_nothing_els
     assert folders <= {"bake", "operators", "preview", "shaders", "tree", "presets"}
     top = {name for name in names if "/" not in name}
     assert top == {"LICENSE", "README.md", "__init__.py", "__main__.py", "blender_manifest.toml"}
+
+
+def test_what_a_user_leaves_in_the_repository_is_not_packaged(repository, tmp_path):
+    for name in (*SOURCES, "tools"):
+        source = repository / name
+        copy = shutil.copytree if source.is_dir() else shutil.copy
+        copy(source, tmp_path / name)
+    for name in ("lamp.blend", "bake/notes.txt", "hall/world.json", "hall/cell_0_0.tree"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("mine")
+    subprocess.run([sys.executable, str(tmp_path / "tools" / "package.py"), str(tmp_path)], check=True)
+    (file,) = tmp_path.glob("*.zip")
+    assert not [name for name in zipfile.ZipFile(file).namelist() if "hall" in name or not name.endswith(PACKAGED)]
 
 
 def test_a_manifest_that_breaks_blenders_rules_is_refused(repository, tmp_path):
