@@ -23,7 +23,17 @@ from . import job, reference, snapshot_file
 from .arrays import check_output, one_line, read_points, write_array
 from .place import SNAPSHOT_NAME, check_target, scene_defects
 from .progress import Progress
-from .settings import ERRORS, QUALITIES, Settings, SettingsError, has_free_sun, numbers, of_reference, unit
+from .settings import (
+    CACHED_BOUNCES,
+    ERRORS,
+    QUALITIES,
+    Settings,
+    SettingsError,
+    has_free_sun,
+    numbers,
+    of_reference,
+    unit,
+)
 from .snapshot import Snapshot, SnapshotError
 
 EXPECTED = (SnapshotError, SettingsError, container.FileError, OSError, ValueError, MemoryError)
@@ -172,6 +182,8 @@ def _add_bake(commands) -> None:
     command.add_argument("-o", "--output", type=_path, required=True, metavar="DIR")
     command.add_argument("--quality", choices=tuple(QUALITIES), default="preview")
     command.add_argument("--samples", type=_positive, help="paths per data point, instead of the quality's")
+    text = "cache ends paths on surfaces whose light is known; paths follows each to its end"
+    command.add_argument("--method", choices=("paths", "cache"), default="paths", help=text)
     command.add_argument("--finest", type=float, default=0.0, help="size of the finest voxels in metres")
     text = "subdivide where the relative error of surface irradiance is above this; 0: wherever geometry is not flat"
     command.add_argument("--error", type=_error, help=text)
@@ -180,7 +192,7 @@ def _add_bake(commands) -> None:
     text = "most bytes of a world cell, such as 500k or 2M: what buys least is left coarse"
     command.add_argument("--max-bytes", type=_bytes, default=0, help=text)
     command.add_argument("--no-fit", action="store_true", help="keep data points as traced, not fitted to surfaces")
-    text = "full gives surfaces data of the finest voxels alone: two to five times the data"
+    text = "full gives surfaces data of the finest voxels alone: two to eight times the data"
     command.add_argument("--dilation", choices=("partial", "full"), default="partial", help=text)
     command.add_argument("--cells", type=_cells, help="only these world cells: 0,1/3,2")
     _add_light(command)
@@ -224,9 +236,10 @@ def _add_points(command: argparse.ArgumentParser) -> None:
 
 def _run_bake(options, extract: Extract, progress: Progress) -> dict:
     samples, bounces = QUALITIES[options.quality]
+    bounces = CACHED_BOUNCES if options.method == "cache" else bounces
     settings = _settings(options, options.samples or samples, bounces, options.finest)
     error = ERRORS[options.quality] if options.error is None else options.error
-    own = {"error": error, "fit": not options.no_fit, "dilation": options.dilation}
+    own = {"error": error, "fit": not options.no_fit, "dilation": options.dilation, "method": options.method}
     own |= {"max_points": options.max_points, "max_bytes": options.max_bytes}
     settings = dataclasses.replace(settings, **own)
     check_target(options.output)

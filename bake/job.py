@@ -21,7 +21,7 @@ from ..tree.grid import FIRST_SIZE, Grid
 from ..tree.outline import Outline, outline
 from ..tree.planes import of_cell
 from ..tree.topology import Topology
-from . import snapshot_file
+from . import radiosity, snapshot_file
 from .fills import fills
 from .gather import CancelledError, Effort
 from .measured import split
@@ -45,6 +45,9 @@ BUDGET_TRIES = 4
 
 BUDGET_MARGIN = 0.97
 """Part of the bytes that the next try aims at."""
+
+CACHED = 0.1
+"""Part of a cell's progress that its surface cache takes."""
 
 STEPS = 1000
 """Units of progress in a cell."""
@@ -184,6 +187,22 @@ class _Work:
     judge: Judge
     target: Target
     warnings: list[str] = field(default_factory=list)
+    shared: list[Scene] = field(default_factory=list)
+
+    def light_in(self, cell: Outline, show: Callable[[float], bool]) -> Scene:
+        """The scene, with a surface cache if there is to be one: of a scene no larger than a cell the same for all."""
+        if self.settings.method != "cache" or self.shared:
+            return self.shared[0] if self.shared else self.scene
+        bounds, small = (
+            self.scene.soup.bounds,
+            np.ptp(self.scene.soup.bounds[:, :2], axis=0).max() <= self.grid.cell_size,
+        )
+        dense = np.stack([cell.dense.low, cell.dense.low + cell.dense.shape]) * self.grid.first_size
+        box = np.stack([bounds[0], np.nextafter(bounds[1], np.inf)]) if small else dense
+        scene = radiosity.around(self.scene, self.grid, box, self.target.effort, lambda share: show(CACHED * share))
+        if small:
+            self.shared.append(scene)
+        return scene
 
 
 def _judge(snapshot: Snapshot, settings: Settings, scene: Scene) -> Judge:
@@ -235,10 +254,12 @@ def _bake_cell(work: _Work, cell: tuple[int, int], show: Callable[[float], bool]
     takes more bytes than it may."""
     found = outline(work.scene.soup.corners, work.grid, cell, by_light=work.target.error > 0)
     _check_cap(found, work.target.max_points)
-    target, limit = work.target, work.settings.max_bytes
+    scene, target, limit = work.light_in(found, show), work.target, work.settings.max_bytes
+    if scene is not work.scene:
+        whole, show = show, lambda share: whole(CACHED + (1 - CACHED) * share)
     for attempt in range(BUDGET_TRIES):
         last = attempt == BUDGET_TRIES - 1
-        refined = refine(work.scene, found, work.judge, target, _part_of(show, attempt) if limit else show)
+        refined = refine(scene, found, work.judge, target, _part_of(show, attempt) if limit else show)
         size = _write(work, cell, refined, 0 if last else limit)
         if last or not limit or size <= limit:
             break

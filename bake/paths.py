@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -132,13 +133,39 @@ class Numbers:
         return tuple(self._sampler.uniform(point, sample, first + k) for k in range(count))
 
 
+class Cache(Protocol):
+    """What ends paths early, as it knows the light that surfaces send back."""
+
+    def finish(self, wave: Wave, vertex: Vertex, travelled: np.ndarray, light: Radiance) -> tuple:
+        """Add the light that some paths' vertices send back.
+
+        Parameters
+        ----------
+        wave : Wave
+            Paths.
+        vertex : Vertex
+            Where they are.
+        travelled : (n,) float32 ndarray
+            Length of their last leg [m].
+        light : Radiance
+            What they bring is added here.
+
+        Returns
+        -------
+        left : (m,) int64 ndarray
+            Rows of the paths for which direct light is still to be looked for.
+        on : (k,) int64 ndarray
+            Which of these go on after that.
+        """
+
+
 def trace(scene: Scene, wave: Wave, numbers: Numbers, bounces: int) -> Radiance:
-    """Follow paths until they leave, are absorbed, or have been reflected `bounces` times.
+    """Follow paths until they leave, are absorbed, end in a cache, or have been reflected `bounces` times.
 
     Parameters
     ----------
     scene : Scene
-        What they travel through.
+        What they travel through; its `cache`, where it has one, ends paths.
     wave : Wave
         One path for each ray, `lane` counting from 0, `beta` 1; used up.
     numbers : Numbers
@@ -155,26 +182,101 @@ def trace(scene: Scene, wave: Wave, numbers: Numbers, bounces: int) -> Radiance:
 
     Notes
     -----
-    Error: unbiased up to the bounce limit; noise only. Tested against closed forms in `tests/bake`.
+    Error: unbiased up to the bounce limit without a cache; noise only. Tested against closed forms in `tests/bake`.
     Source: Kajiya 1986; Veach 1997, section 9.2, balance heuristic for emitters, an uneven sky and lit spots.
     """
     light = Radiance.zeros(scene, len(wave.lane))
-    for bounce in range(bounces + 1):
+    _follow(scene, wave, numbers, (0, bounces), light, scene.cache)
+    return light
+
+
+def shine(scene: Scene, vertex: Vertex, numbers: Numbers) -> Radiance:
+    """Direct light on surfaces, of all that can be looked for there; emitters and a sky that paths find by chance
+    are weighed against that.
+
+    Parameters
+    ----------
+    scene : Scene
+        What shines; without lit spots.
+    vertex : Vertex
+        Points on surfaces, one for each lane.
+    numbers : Numbers
+        Their random numbers.
+
+    Returns
+    -------
+    Radiance
+        Irradiance there [W/m2], where the reflectance is pi.
+    """
+    light = Radiance.zeros(scene, len(vertex.triangle))
+    travelled = np.zeros(len(vertex.triangle), np.float32)
+    _shine(scene, _leaving(vertex), vertex, numbers, (0, 1), travelled, light)
+    return light
+
+
+def arriving(scene: Scene, vertex: Vertex, numbers: Numbers, bounces: int, cache: Cache) -> Radiance:
+    """Light that paths from surfaces find by chance: all but what `shine` looks for.
+
+    Parameters
+    ----------
+    scene : Scene
+        What they travel through; without lit spots.
+    vertex : Vertex
+        Points on surfaces, one for each lane.
+    numbers : Numbers
+        Their random numbers.
+    bounces : int
+        Reflections on the way, the points' own among them.
+    cache : Cache
+        What ends paths.
+
+    Returns
+    -------
+    Radiance
+        Irradiance there [W/m2], where the reflectance is pi.
+    """
+    light = Radiance.zeros(scene, len(vertex.triangle))
+    _follow(scene, _scatter(_leaving(vertex), vertex, numbers, 0), numbers, (1, bounces), light, cache)
+    return light
+
+
+def _leaving(vertex: Vertex) -> Wave:
+    """Paths that begin on surfaces."""
+    count = len(vertex.triangle)
+    ones = np.ones((3, count), np.float32)
+    return Wave(np.arange(count), vertex.position, ones, ones.copy(), np.ones(count, np.float32))
+
+
+def _follow(scene: Scene, wave: Wave, numbers: Numbers, limits: tuple[int, int], light: Radiance, cache) -> None:
+    """Follow paths from one vertex to another, these included."""
+    first, last = limits
+    for bounce in range(first, last + 1):
         wave, hits, travelled = _advance(scene, wave, numbers, bounce, light)
         if not len(wave.lane):
             break
         _add_emission(scene, wave, hits, travelled, light)
-        if bounce == bounces:
+        if bounce == last:
             break
         vertex = _arrive(scene, wave, hits, travelled)
-        _add_lamps(scene, wave, vertex, numbers, bounce, travelled, light)
-        if bounce + 1 < bounces:
-            _add_lit_spots(scene, wave, vertex, numbers, bounce, light)
-        _add_emitters(scene, wave, vertex, numbers, bounce, light)
-        _add_suns(scene, wave, vertex, numbers, bounce, light)
-        _add_sky(scene, wave, vertex, numbers, bounce, light)
+        on = None
+        if cache is not None:
+            left, on = cache.finish(wave, vertex, travelled, light)
+            wave, vertex, travelled = wave.take(left), vertex.take(left), travelled[left]
+        _shine(scene, wave, vertex, numbers, (bounce, last), travelled, light)
+        if on is not None:
+            wave, vertex = wave.take(on), vertex.take(on)
         wave = _scatter(wave, vertex, numbers, bounce)
-    return light
+
+
+def _shine(scene: Scene, wave: Wave, vertex, numbers: Numbers, limits: tuple[int, int], travelled, light) -> None:
+    """Look for light at vertices: lamps, lit spots, emitters, suns, an uneven sky."""
+    bounce, last = limits
+    _add_lamps(scene, wave, vertex, numbers, bounce, travelled, light)
+    if bounce + 1 < last:
+        _add_lit_spots(scene, wave, vertex, numbers, bounce, light)
+    _add_emitters(scene, wave, vertex, numbers, bounce, light)
+    _add_suns(scene, wave, vertex, numbers, bounce, light)
+    _add_sky(scene, wave, vertex, numbers, bounce, light)
 
 
 @dataclass
@@ -185,6 +287,21 @@ class Vertex:
     position: np.ndarray
     normal: np.ndarray
     reflectance: np.ndarray
+
+    def take(self, rows: np.ndarray) -> Vertex:
+        """Some of them.
+
+        Parameters
+        ----------
+        rows : (m,) int64 ndarray
+            Which.
+
+        Returns
+        -------
+        Vertex
+            Copies.
+        """
+        return Vertex(self.triangle[rows], self.position[:, rows], self.normal[:, rows], self.reflectance[:, rows])
 
 
 def _advance(scene: Scene, wave: Wave, numbers: Numbers, bounce: int, light: Radiance):

@@ -63,6 +63,7 @@ class Scene:
     sky: Sky
     model: Model
     origin: np.ndarray
+    cache: object | None = None
 
     @property
     def has_local(self) -> bool:

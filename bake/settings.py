@@ -23,6 +23,9 @@ from .snapshot import Snapshot, SnapshotError
 QUALITIES = {"draft": (64, 6), "preview": (256, 8), "final": (1024, 12)}
 """(paths per data point, bounces) by name; doubling the paths takes about a third off the noise."""
 
+CACHED_BOUNCES = 64
+"""Bounces with a surface cache, where they cost hardly any time; light that is left is less than rounding by then."""
+
 ERRORS = {"draft": 0.2, "preview": 0.1, "final": 0.05}
 """Relative error of surface irradiance above which a voxel is subdivided, by name of the quality."""
 
@@ -55,11 +58,12 @@ class Settings:
     sky : "scene", "harmonics", or three numbers with commas: the radiance of a uniform sky
     sun : "scene", "none", "hemisphere", "arc:FILE", or a direction to the sun as x,y,z
     finest : size of the finest voxels [m]; 0 chooses it for the scene
-    dilation : "partial", or "full": surfaces have data of the finest level alone, for two to five times the size
+    dilation : "partial", or "full": surfaces have data of the finest level alone, for two to eight times the size
     seed : another seed gives independent noise
     error : relative error of surface irradiance above which a voxel is subdivided; 0: wherever geometry is not flat
     max_points, max_bytes : most data points and bytes of a world cell; 0 bytes for no limit
     fit : whether data points are fitted to what surfaces see of them
+    method : "paths" follows every path to its end, "cache" ends most on surfels, whose light is known
     """
 
     samples: int = QUALITIES["preview"][0]
@@ -73,6 +77,7 @@ class Settings:
     max_points: int = MAX_POINTS
     max_bytes: int = 0
     fit: bool = True
+    method: str = "paths"
 
     @property
     def receiver_samples(self) -> int:
@@ -362,7 +367,8 @@ def _read_arc(path: Path) -> np.ndarray:
     try:
         text = path.read_text()
     except (OSError, UnicodeDecodeError) as error:
-        raise SettingsError(f"--sun arc:{path}: cannot be read ({error})") from error
+        reason = getattr(error, "strerror", None) or "it is no text"
+        raise SettingsError(f"--sun arc:{path}: cannot be read ({reason})") from error
     lines = [",".join(line.replace(",", " ").split()) for line in text.splitlines() if line.strip()]
     if not lines:
         raise SettingsError(f"--sun arc:{path}: holds no directions; write one per line as x y z")

@@ -358,6 +358,14 @@ def test_a_file_of_sun_directions_is_checked_before_the_bake(level, tmp_path, te
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(("words", "bounces"), [((), 64), (("--bounces", "3"), 3)])
+def test_the_surface_cache_follows_light_for_longer_unless_told_otherwise(level, tmp_path, words, bounces):
+    succeed("bake", level, "-o", tmp_path / "out", *QUICK, "--method", "cache", *words)
+    settings = json.loads((tmp_path / "out" / "world.json").read_text())["settings"]
+    assert (settings["method"], settings["bounces"]) == ("cache", bounces)
+    assert (Points(tmp_path, *ground_points(5)).ask("query", tmp_path / "out") > 0).all()
+
+
 @pytest.mark.parametrize(
     "words",
     [
@@ -388,6 +396,7 @@ def test_a_file_of_sun_directions_is_checked_before_the_bake(level, tmp_path, te
         ["bake", "level.giv", "-o", "out", "--max-bytes", "-5"],
         ["bake", "level.giv", "-o", "out", "--dilation", "none"],
         ["bake", "level.giv", "-o", "out", "--no-fit", "yes"],
+        ["bake", "level.giv", "-o", "out", "--method", "photons"],
         ["query", "out", "--points", "p.npy", "-o", "e.npy"],
         ["query", "out", "--points", "p.npy", "--normals", "n.npy", "-o", "e.npy", "--transport", "moon"],
         ["compare", "out", "-o", "seen.png", "--size", "12"],

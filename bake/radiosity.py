@@ -1,0 +1,213 @@
+"""Fills the surface cache of a cell: finds its surfels, lights them, and lets light bounce between them.
+
+Comes in: a scene, receivers in the cell. Goes out: the scene with a cache. Paths from the receivers meet the surfaces
+that matter; those surfels are kept. Each one's irradiance is
+
+    E = direct light + what rays bring that end elsewhere + sum over rays of (weight * E of the surfel that it met)
+
+with all rays traced once, and solved for all transports together by iterating over what they met.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+
+from ..tree.grid import Grid
+from . import paths, receivers
+from .discovery import Places, Spending, find, numbers, tiles, vertex
+from .gather import TILE_LANES, Effort, run_tiles
+from .lit_spots import LitSpots
+from .paths import Radiance, Vertex, Wave
+from .receivers import Receivers
+from .scene import Scene
+from .sobol import scramble
+from .surfels import NONE, Known, Lattice, Surfels, Table, reflected
+
+__all__ = ["around", "cached"]
+
+FOUND = 0.3
+"""Part of the progress that they take."""
+
+BLOCK = 1 << 20
+"""Numbers that are read at a time."""
+
+LEFT = 1e-4
+"""Light that is still under way when the bounces end, in all light."""
+
+CUBES = 32
+"""Least cubes along a first-level voxel: 0.25 m at human scale."""
+
+RECEIVERS = 2
+"""Receivers along a second-level voxel: a metre apart at human scale."""
+
+
+def cached(
+    scene: Scene,
+    at: Receivers,
+    lattice: Lattice,
+    effort: Effort,
+    spending: Spending,
+    progress: Callable[[float], bool] | None = None,
+) -> Scene:
+    """Give a scene a surface cache.
+
+    Parameters
+    ----------
+    scene : Scene
+        What light travels through.
+    at : Receivers
+        Where the surfels that matter are seen from.
+    lattice : Lattice
+        Cubes around the cell.
+    effort : Effort
+        Bounces, seed, threads.
+    spending : Spending
+        Sizes.
+    progress : callable, optional
+        Called with the part that is done, 0 to 1; returns False to stop.
+
+    Returns
+    -------
+    Scene
+        With a cache, and without lit spots: these are part of the cache.
+
+    Raises
+    ------
+    CancelledError
+        `progress` returned False.
+
+    Notes
+    -----
+    Error: light is even over a surfel, as the receivers' paths see it; see `docs/accuracy.md`.
+    Source: Arvo and Kirk 1990; Christensen 2008, "Point-based approximate global illumination".
+    """
+    spots = LitSpots(scene.lamps, scene.tracer, scene.surfaces, wanted=False)
+    scene = dataclasses.replace(scene, lit_spots=spots, cache=None)
+    show = progress or (lambda share: True)
+    lattice, places = find(scene, at, lattice, effort, spending, lambda share: show(FOUND * share))
+    work = _Work(scene, lattice, places, effort, spending)
+    work.run(lambda share: show(FOUND + (1 - FOUND) * share))
+    return dataclasses.replace(scene, cache=Surfels(work.known, *_solve(work)))
+
+
+def around(
+    scene: Scene, grid: Grid, box: np.ndarray, effort: Effort, progress: Callable[[float], bool] | None = None
+) -> Scene:
+    """Give a scene a surface cache for what lies in a box.
+
+    Parameters
+    ----------
+    scene : Scene
+        What light travels through.
+    grid : Grid
+        The lattice of the bake.
+    box : (2, 3) float64 ndarray
+        Lowest and highest corner of what is baked, relative to the scene's origin [m].
+    effort : Effort
+        Seed, threads; light bounces until hardly any is left.
+    progress : callable, optional
+        As for `cached`.
+
+    Returns
+    -------
+    Scene
+        As `cached` returns it.
+
+    Raises
+    ------
+    CancelledError
+        `progress` returned False.
+    """
+    spacing = float(grid.voxel_size(min(1, grid.levels - 1))) / RECEIVERS
+    at = receivers.spread(scene, *box, spacing, threads=effort.threads)
+    low, high = np.maximum(box[0], scene.soup.bounds[0]), np.minimum(box[1], scene.soup.bounds[1])
+    lattice = Lattice(low.astype(np.float32), high.astype(np.float32), grid.first_size / CUBES)
+    return cached(scene, at, lattice, effort, Spending(), progress)
+
+
+class _Recorder:
+    """A cache that ends paths on surfels, and remembers which and how much they count."""
+
+    def __init__(self, known: Known, lanes: int) -> None:
+        self.known = known
+        self.number = np.full(lanes, NONE, np.int32)
+        self.near = np.zeros(lanes, bool)
+        self.weight = np.zeros((3, lanes), np.float32)
+
+    def finish(self, wave: Wave, vertex: Vertex, travelled: np.ndarray, light: Radiance) -> tuple:
+        number, near = self.known.which(vertex, travelled)
+        rows = np.flatnonzero(number >= 0)
+        self.number[wave.lane[rows]], self.near[wave.lane[rows]] = number[rows], near[rows]
+        self.weight[:, wave.lane[rows]] = reflected(wave, vertex, rows)
+        left = np.flatnonzero((number < 0) | near)
+        return left, np.flatnonzero(number[left] < 0)
+
+
+class _Work:
+    """Everything that rays are traced for, surfel by surfel."""
+
+    def __init__(self, scene: Scene, lattice: Lattice, places: Places, effort: Effort, spending: Spending) -> None:
+        self.scene, self.places, self.effort, self.spending = scene, places, effort, spending
+        count, functions = len(places.key), 1 + len(scene.model.suns.toward) + scene.model.sky_count
+        self.known = Known(lattice, Table(places.key), places.middle, places.crowded, scene.tracer)
+        self.direct, self.found = np.zeros((2, 3, count, functions), np.float32)
+        self.number = np.zeros((count, spending.rays), np.int32)
+        self.near = np.zeros((count, spending.rays), bool)
+        self.weight = np.zeros((3, count, spending.rays), np.float32)
+
+    def run(self, show: Callable[[float], bool]) -> None:
+        """Trace in tiles."""
+        count = len(self.places.key)
+        parts = tiles(count, TILE_LANES // self.spending.rays)
+        run_tiles(self.light, parts, self.effort.threads, lambda done: show(done / count))
+
+    def light(self, rows: np.ndarray) -> int:
+        """Direct light of some surfels, and where their rays end."""
+        places, rays = self.spending.places, self.spending.rays
+        low, high = (self.places.key[rows] >> shift & 0xFFFFFFFF for shift in (0, 32))
+        keys = scramble(low.astype(np.uint32), 0) ^ high.astype(np.uint32)
+        near, far = (numbers(keys, self.effort.seed, 1 + k, count) for k, count in enumerate((places, rays)))
+        direct = paths.shine(self.scene, self.at(rows, places), near)
+        recorder = _Recorder(self.known, len(rows) * rays)
+        chance = paths.arriving(self.scene, self.at(rows, rays), far, self.effort.bounces, recorder)
+        for target, part, count in (self.direct, direct, places), (self.found, chance, rays):
+            stacked = np.concatenate([part.local[None], part.sun, part.sky])
+            target[:, rows] = stacked.reshape(*stacked.shape[:2], -1, count).mean(axis=3).transpose(1, 2, 0)
+        self.number[rows] = recorder.number.reshape(-1, rays)
+        self.near[rows] = recorder.near.reshape(-1, rays)
+        self.weight[:, rows] = recorder.weight.reshape(3, -1, rays) / np.float32(rays)
+        return len(rows)
+
+    def at(self, rows: np.ndarray, count: int) -> Vertex:
+        """Places on surfels, `count` on each."""
+        place = (rows[:, None] * self.spending.places + np.arange(count) % self.spending.places).reshape(-1)
+        return vertex(self.places.position[:, place], self.places.normal[:, place])
+
+
+def _solve(work: _Work) -> tuple[np.ndarray, np.ndarray]:
+    """(n, functions, 3) irradiance after all bounces, and what of it is indirect: E = direct + found + links (E - near
+    direct), as rays that end near by have looked for direct light themselves."""
+    total = work.found - _passed(work, work.direct, work.near)
+    last = total = total + work.direct
+    for _ in range(work.effort.bounces - 1):
+        last = _passed(work, last)
+        total = total + last
+        if np.abs(last).sum() <= LEFT * np.abs(total).sum():
+            break
+    return tuple(np.ascontiguousarray(part.transpose(1, 2, 0)) for part in (total, total - work.direct))
+
+
+def _passed(work: _Work, light: np.ndarray, only: np.ndarray | None = None) -> np.ndarray:
+    """(3, n, functions) what rays bring of the irradiance of the surfels that they met."""
+    passed, number = np.empty_like(light), np.maximum(work.number, 0)
+    step = max(1, BLOCK // (number.shape[1] * max(light.shape[2], 1)))
+    for first in range(0, light.shape[1], step):
+        part = slice(first, first + step)
+        for channel in range(3):
+            weight = work.weight[channel, part] if only is None else work.weight[channel, part] * only[part]
+            read = light[channel].take(number[part], axis=0, mode="clip")
+            passed[channel, part] = np.matmul(weight[:, None], read)[:, 0]
+    return passed
