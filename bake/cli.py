@@ -183,7 +183,7 @@ def _add_bake(commands) -> None:
     command.add_argument("--quality", choices=tuple(QUALITIES), default="preview")
     command.add_argument("--samples", type=_positive, help="paths per data point, instead of the quality's")
     text = "cache ends paths on surfaces whose light is known; paths follows each to its end"
-    command.add_argument("--method", choices=("paths", "cache"), default="paths", help=text)
+    command.add_argument("--method", choices=("cache", "paths"), default="cache", help=text)
     command.add_argument("--finest", type=float, default=0.0, help="size of the finest voxels in metres")
     text = "subdivide where the relative error of surface irradiance is above this; 0: wherever geometry is not flat"
     command.add_argument("--error", type=_error, help=text)

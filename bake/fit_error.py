@@ -111,7 +111,7 @@ def _single_leverage(system: System, solver: Solver) -> np.ndarray:
     row = np.where(system.weight != 0, system.row, 0)
     basis, total = system.basis.astype(np.float32), np.zeros(len(row), np.float32)
     for tap in range(row.shape[1] if system.points else 0):
-        part = np.einsum("ni,nij,nj->n", basis, solver.inverse[row[:, tap]], basis)
+        part = (np.matmul(basis[:, None], solver.inverse[row[:, tap]])[:, 0] * basis).sum(axis=1)
         total += system.weight[:, tap].astype(np.float32) ** 2 * part
     weight = np.empty_like(total)
     weight[system.operator.order] = system.operator.weight[:, 0]
