@@ -96,6 +96,8 @@ class LitSpots:
             What the spot reflects of the lamp's light [W/(m2 sr)].
         pdf_solid_angle : (m,) float32 ndarray
             Density of the way there [1/sr].
+        normal : (3, m) float32 ndarray
+            Unit normal of the spot, towards the point.
         """
         rows = np.flatnonzero(u[0] < self._cdf[-1])
         lamp = np.searchsorted(self._cdf, u[0][rows], side="right")
@@ -108,7 +110,7 @@ class LitSpots:
         on = np.flatnonzero((hits.triangle != MISS) & (density > 0) & (facing > 0))
         numbers = [part[on] for part in self._on_lamp(lamp, u, rows)]
         light = light[:, on] * self._reflected(lamp[on], spot[:, on], normal[:, on], hits.take(on), numbers)
-        return rows[on], toward[:, on], light, density[on]
+        return rows[on], toward[:, on], light, density[on], normal[:, on]
 
     def pdf_solid_angle(self, lamp, source, spot, normal, toward: np.ndarray) -> np.ndarray:
         """Density with which `sample` would have gone to where paths met a surface that a lamp shines on.

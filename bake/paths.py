@@ -158,6 +158,22 @@ class Cache(Protocol):
             Which of these go on after that.
         """
 
+    def leaves(self, position: np.ndarray, normal: np.ndarray, travelled: np.ndarray) -> np.ndarray:
+        """Say for which paths direct light is still to be looked for where they arrive.
+
+        Parameters
+        ----------
+        position, normal : (3, n) float32 ndarray
+            Where they arrive [m], and unit normals there.
+        travelled : (n,) float32 ndarray
+            Length of their last leg [m].
+
+        Returns
+        -------
+        (m,) int64 ndarray
+            The rows that `finish` would return first.
+        """
+
 
 def trace(scene: Scene, wave: Wave, numbers: Numbers, bounces: int) -> Radiance:
     """Follow paths until they leave, are absorbed, end in a cache, or have been reflected `bounces` times.
@@ -210,7 +226,7 @@ def shine(scene: Scene, vertex: Vertex, numbers: Numbers) -> Radiance:
     """
     light = Radiance.zeros(scene, len(vertex.triangle))
     travelled = np.zeros(len(vertex.triangle), np.float32)
-    _shine(scene, _leaving(vertex), vertex, numbers, (0, 1), travelled, light)
+    _shine(scene, _leaving(vertex), vertex, numbers, 0, travelled, light)
     return light
 
 
@@ -262,18 +278,17 @@ def _follow(scene: Scene, wave: Wave, numbers: Numbers, limits: tuple[int, int],
         if cache is not None:
             left, on = cache.finish(wave, vertex, travelled, light)
             wave, vertex, travelled = wave.take(left), vertex.take(left), travelled[left]
-        _shine(scene, wave, vertex, numbers, (bounce, last), travelled, light)
+        _shine(scene, wave, vertex, numbers, bounce, travelled, light)
         if on is not None:
             wave, vertex = wave.take(on), vertex.take(on)
+        if bounce + 1 < last:
+            _add_lit_spots(scene, wave, vertex, numbers, bounce, light)
         wave = _scatter(wave, vertex, numbers, bounce)
 
 
-def _shine(scene: Scene, wave: Wave, vertex, numbers: Numbers, limits: tuple[int, int], travelled, light) -> None:
-    """Look for light at vertices: lamps, lit spots, emitters, suns, an uneven sky."""
-    bounce, last = limits
+def _shine(scene: Scene, wave: Wave, vertex: Vertex, numbers: Numbers, bounce: int, travelled, light) -> None:
+    """Look for light at vertices: lamps, emitters, suns, an uneven sky."""
     _add_lamps(scene, wave, vertex, numbers, bounce, travelled, light)
-    if bounce + 1 < last:
-        _add_lit_spots(scene, wave, vertex, numbers, bounce, light)
     _add_emitters(scene, wave, vertex, numbers, bounce, light)
     _add_suns(scene, wave, vertex, numbers, bounce, light)
     _add_sky(scene, wave, vertex, numbers, bounce, light)
@@ -400,13 +415,35 @@ def _add_lit_spots(scene: Scene, wave: Wave, vertex: Vertex, numbers: Numbers, b
         return
     u = numbers.draw(wave.lane, HASHED + bounce * HASHED_PER_VERTEX + SPOT, lit_spots.NUMBERS)
     ends = passing(numbers, wave.lane, bounce + 1)  # as the path's own next leg: what either brings is only added
-    some, toward, radiance, density = scene.lit_spots.sample(vertex.position, u, ends)
+    some, toward, radiance, density = spots(scene, vertex.position, u, ends)
     position, normal = vertex.position[:, some], vertex.normal[:, some]
     length = np.sqrt(warp.dot(toward, toward))
     cosine = np.maximum(warp.dot(toward, normal), 0) / np.maximum(length, np.float32(1e-30))
     value = radiance * (cosine / (density + cosine * np.float32(1 / np.pi)))
     rows, tint = unblocked(scene, position, toward, TARGET_SHORTENED, cosine > 0)
     _collect(light.local, wave, vertex, some[rows], value[:, rows] * tint)
+
+
+def spots(scene: Scene, position: np.ndarray, u: tuple[np.ndarray, ...], ends) -> tuple[np.ndarray, ...]:
+    """Ways to lit spots; those whose light a cache brings to paths are left out.
+
+    Parameters
+    ----------
+    scene : Scene
+        With lit spots.
+    position, u, ends
+        As for `LitSpots.sample`.
+
+    Returns
+    -------
+    rows, toward, radiance, pdf_solid_angle
+        As of `LitSpots.sample`.
+    """
+    some, toward, radiance, density, normal = scene.lit_spots.sample(position, u, ends)
+    if scene.cache is None:
+        return some, toward, radiance, density
+    kept = scene.cache.leaves(position[:, some] + toward, normal, np.sqrt(warp.dot(toward, toward)))
+    return some[kept], toward[:, kept], radiance[:, kept], density[kept]
 
 
 def _add_emitters(scene: Scene, wave: Wave, vertex: Vertex, numbers: Numbers, bounce: int, light: Radiance) -> None:

@@ -16,11 +16,13 @@ from collections.abc import Callable
 import numpy as np
 
 from ..tree.grid import Grid
-from . import paths, receivers
-from .discovery import Places, Spending, find, numbers, tiles, vertex
+from . import paths, receivers, warp
+from .discovery import OPEN, Places, Spending, find, numbers, tiles, vertex
 from .gather import TILE_LANES, Effort, run_tiles
+from .lamps import luminance
 from .lit_spots import LitSpots
-from .paths import Radiance, Vertex, Wave
+from .paths import Numbers, Radiance, Vertex, Wave
+from .rays import MISS
 from .receivers import Receivers
 from .scene import Scene
 from .sobol import scramble
@@ -33,6 +35,14 @@ FOUND = 0.3
 
 BLOCK = 1 << 20
 """Numbers that are read at a time."""
+
+UNEVEN = 0.2
+"""Standard deviation of the mean direct light of lamps on a surfel, relative to it, above which paths look for that
+light themselves, with the help of lit spots. An edge through the middle of 16 places has 0.25; a lamp a sixth of a cube
+off a wall as much, though none of them may lie in its spot."""
+
+MANY = 256
+"""Places where these are lit directly."""
 
 LEFT = 1e-4
 """Light that is still under way when the bounces end, in all light."""
@@ -72,7 +82,7 @@ def cached(
     Returns
     -------
     Scene
-        With a cache, and without lit spots: these are part of the cache.
+        With a cache.
 
     Raises
     ------
@@ -85,12 +95,13 @@ def cached(
     Source: Arvo and Kirk 1990; Christensen 2008, "Point-based approximate global illumination".
     """
     spots = LitSpots(scene.lamps, scene.tracer, scene.surfaces, wanted=False)
-    scene = dataclasses.replace(scene, lit_spots=spots, cache=None)
+    whole, scene = scene, dataclasses.replace(scene, lit_spots=spots, cache=None)
     show = progress or (lambda share: True)
     lattice, places = find(scene, at, lattice, effort, spending, lambda share: show(FOUND * share))
     work = _Work(scene, lattice, places, effort, spending)
     work.run(lambda share: show(FOUND + (1 - FOUND) * share))
-    return dataclasses.replace(scene, cache=Surfels(work.known, *_solve(work)))
+    known = dataclasses.replace(work.known, uneven=work.uneven)
+    return dataclasses.replace(whole, cache=Surfels(known, *_solve(work)))
 
 
 def around(
@@ -138,7 +149,7 @@ class _Recorder:
         self.weight = np.zeros((3, lanes), np.float32)
 
     def finish(self, wave: Wave, vertex: Vertex, travelled: np.ndarray, light: Radiance) -> tuple:
-        number, near = self.known.which(vertex, travelled)
+        number, near = self.known.which(vertex.position, vertex.normal, travelled)
         rows = np.flatnonzero(number >= 0)
         self.number[wave.lane[rows]], self.near[wave.lane[rows]] = number[rows], near[rows]
         self.weight[:, wave.lane[rows]] = reflected(wave, vertex, rows)
@@ -152,7 +163,8 @@ class _Work:
     def __init__(self, scene: Scene, lattice: Lattice, places: Places, effort: Effort, spending: Spending) -> None:
         self.scene, self.places, self.effort, self.spending = scene, places, effort, spending
         count, functions = len(places.key), 1 + len(scene.model.suns.toward) + scene.model.sky_count
-        self.known = Known(lattice, Table(places.key), places.middle, places.crowded, scene.tracer)
+        self.uneven = np.zeros(count, bool)
+        self.known = Known(lattice, Table(places.key), places.middle, places.crowded, self.uneven.copy(), scene.tracer)
         self.direct, self.found = np.zeros((2, 3, count, functions), np.float32)
         self.number = np.zeros((count, spending.rays), np.int32)
         self.near = np.zeros((count, spending.rays), bool)
@@ -163,28 +175,72 @@ class _Work:
         count = len(self.places.key)
         parts = tiles(count, TILE_LANES // self.spending.rays)
         run_tiles(self.light, parts, self.effort.threads, lambda done: show(done / count))
+        rows = np.flatnonzero(self.uneven)
+        run_tiles(self.look_closer, [rows[part] for part in tiles(len(rows), TILE_LANES // MANY)], self.effort.threads)
 
     def light(self, rows: np.ndarray) -> int:
         """Direct light of some surfels, and where their rays end."""
         places, rays = self.spending.places, self.spending.rays
-        low, high = (self.places.key[rows] >> shift & 0xFFFFFFFF for shift in (0, 32))
-        keys = scramble(low.astype(np.uint32), 0) ^ high.astype(np.uint32)
-        near, far = (numbers(keys, self.effort.seed, 1 + k, count) for k, count in enumerate((places, rays)))
+        near, far = (self.numbers(rows, 1 + k, count) for k, count in enumerate((places, rays)))
         direct = paths.shine(self.scene, self.at(rows, places), near)
         recorder = _Recorder(self.known, len(rows) * rays)
         chance = paths.arriving(self.scene, self.at(rows, rays), far, self.effort.bounces, recorder)
         for target, part, count in (self.direct, direct, places), (self.found, chance, rays):
-            stacked = np.concatenate([part.local[None], part.sun, part.sky])
-            target[:, rows] = stacked.reshape(*stacked.shape[:2], -1, count).mean(axis=3).transpose(1, 2, 0)
+            target[:, rows] = _stacked(part, count).mean(axis=3).transpose(1, 2, 0)
         self.number[rows] = recorder.number.reshape(-1, rays)
         self.near[rows] = recorder.near.reshape(-1, rays)
+        self.uneven[rows] = _is_uneven(luminance(direct.local).reshape(-1, places))
         self.weight[:, rows] = recorder.weight.reshape(3, -1, rays) / np.float32(rays)
         return len(rows)
+
+    def look_closer(self, rows: np.ndarray) -> int:
+        """Direct light of uneven surfels again, at many places all over them: as many as their middle sees."""
+        lane, random = np.repeat(rows, MANY), self.numbers(rows, 3, MANY)
+        position, facing, on = self.beneath(lane, random.draw(np.arange(len(lane)), 0, 2))
+        light = _stacked(paths.shine(self.scene, vertex(position, facing), random), MANY)
+        on = on.reshape(-1, MANY)
+        mean = (light * on).sum(axis=3) / np.maximum(on.sum(axis=1), 1)
+        enough = on.sum(axis=1) >= self.spending.places
+        self.direct[:, rows[enough]] = mean[:, :, enough].transpose(1, 2, 0)
+        return len(rows)
+
+    def beneath(self, lane: np.ndarray, u: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(3, n) places and normals that surfels' middles see around them, and (n,) whether they belong to the surfel;
+        a place that is known where they do not."""
+        start, first = self.places.middle[:, lane], lane * self.spending.places
+        known, normal = self.places.position[:, first], self.places.normal[:, first]
+        size = self.known.lattice.keys(known, normal)[1]
+        right, up = warp.frame(normal)
+        way = (right * (2 * u[0] - 1) + up * (2 * u[1] - 1) - normal * OPEN) * size
+        hits = self.scene.tracer.intersect(start, way)
+        length = np.sqrt(warp.dot(hits.normal, hits.normal))
+        facing = hits.normal * (-np.sign(warp.dot(hits.normal, way)) / np.maximum(length, np.float32(1e-37)))
+        place = start + way * np.where(hits.triangle == MISS, np.float32(0), hits.distance)
+        place += facing * self.scene.tracer.offset(place, size)
+        on = (hits.triangle != MISS) & (self.known.lattice.keys(place, facing)[0] == self.places.key[lane])
+        return np.where(on, place, known), np.where(on, facing, normal), on
+
+    def numbers(self, rows: np.ndarray, stage: int, count: int) -> Numbers:
+        """Random numbers of surfels, `count` lanes for each."""
+        low, high = (self.places.key[rows] >> shift & 0xFFFFFFFF for shift in (0, 32))
+        return numbers(scramble(low.astype(np.uint32), 0) ^ high.astype(np.uint32), self.effort.seed, stage, count)
 
     def at(self, rows: np.ndarray, count: int) -> Vertex:
         """Places on surfels, `count` on each."""
         place = (rows[:, None] * self.spending.places + np.arange(count) % self.spending.places).reshape(-1)
         return vertex(self.places.position[:, place], self.places.normal[:, place])
+
+
+def _stacked(light: Radiance, count: int) -> np.ndarray:
+    """(functions, 3, n, count) light of `count` lanes for each surfel."""
+    stacked = np.concatenate([light.local[None], light.sun, light.sky])
+    return stacked.reshape(*stacked.shape[:2], -1, count)
+
+
+def _is_uneven(light: np.ndarray) -> np.ndarray:
+    """(n,) whether the mean of light at (n, places) is not known to within a part of itself: lamps that are close."""
+    deviation = light.std(axis=1) / np.sqrt(light.shape[1])
+    return deviation > UNEVEN * light.mean(axis=1)
 
 
 def _solve(work: _Work) -> tuple[np.ndarray, np.ndarray]:

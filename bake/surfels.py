@@ -203,6 +203,7 @@ class Known:
     table : Table, numbers of the surfels' keys
     middle : (3, n) float32 [m], a little above the middle of each
     crowded : (n,) bool, whether hits must see it to belong to the surfel
+    uneven : (n,) bool, whether direct light has to be looked for from any distance
     tracer : Tracer
     """
 
@@ -210,15 +211,16 @@ class Known:
     table: Table
     middle: np.ndarray
     crowded: np.ndarray
+    uneven: np.ndarray
     tracer: Tracer
 
-    def which(self, vertex: Vertex, travelled: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def which(self, position: np.ndarray, normal: np.ndarray, travelled: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Find the surfels that end paths.
 
         Parameters
         ----------
-        vertex : Vertex
-            Where paths are.
+        position, normal : (3, n) float32 ndarray
+            Where paths are [m], and unit normals towards where they came from.
         travelled : (n,) float32 ndarray
             Length of their last leg [m].
 
@@ -229,13 +231,15 @@ class Known:
         near : (n,) bool ndarray
             Where direct light has to be looked for.
         """
-        key, size = self.lattice.keys(vertex.position, vertex.normal)
+        key, size = self.lattice.keys(position, normal)
         number = np.where(travelled > NEAR * size, self.table.find(key), np.int32(NONE))
         rows = np.flatnonzero(number >= 0)
-        rows = rows[self.crowded[number[rows]]]
-        seen = open_between(self.tracer, vertex.position[:, rows], self.middle[:, number[rows]])
-        number[rows[~seen]] = NONE
-        return number, travelled <= FAR * size
+        crowd = rows[self.crowded[number[rows]]]
+        seen = open_between(self.tracer, position[:, crowd], self.middle[:, number[crowd]])
+        near = travelled <= FAR * size
+        near[rows] |= self.uneven[number[rows]]
+        number[crowd[~seen]] = NONE
+        return number, near
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,13 +258,18 @@ class Surfels:
 
     def finish(self, wave: Wave, vertex: Vertex, travelled: np.ndarray, light: Radiance) -> tuple:
         """End paths on surfels, with the light that these reflect; see `paths.Cache`."""
-        number, near = self.known.which(vertex, travelled)
+        number, near = self.known.which(vertex.position, vertex.normal, travelled)
         for rows, source in ((number >= 0) & ~near, self.light), ((number >= 0) & near, self.indirect):
             rows = np.flatnonzero(rows)
             if len(rows):
                 _add(light, wave.lane[rows], reflected(wave, vertex, rows), source.take(number[rows], axis=0))
         left = np.flatnonzero((number < 0) | near)
         return left, np.flatnonzero(number[left] < 0)
+
+    def leaves(self, position: np.ndarray, normal: np.ndarray, travelled: np.ndarray) -> np.ndarray:
+        """Say for which paths direct light is still to be looked for; see `paths.Cache`."""
+        number, near = self.known.which(position, normal, travelled)
+        return np.flatnonzero((number < 0) | near)
 
 
 def _add(light: Radiance, lane: np.ndarray, factor: np.ndarray, found: np.ndarray) -> None:

@@ -67,7 +67,8 @@ def measured(scene: Scene, position: np.ndarray, seed: int) -> np.ndarray:
     """(points, functions) mean irradiance around points, over colours."""
     keys = np.arange(position.shape[1], dtype=np.uint32)
     found = gather(scene, HarmonicsSensor(), position, keys, dataclasses.replace(EFFORT, seed=seed))
-    return np.concatenate([found.local[:, None], found.sun, found.sky], axis=1)[:, :, 0].mean(axis=2)
+    parts = [part for part in (found.local[:, None], found.sun, found.sky) if len(part)]
+    return np.concatenate(parts, axis=1)[:, :, 0].mean(axis=2)
 
 
 def free_points(count: int) -> np.ndarray:
@@ -115,6 +116,24 @@ def test_means_of_all_transports_are_those_of_paths(sky):
     assert counts.sum() >= 3
     assert (off < BIAS * np.abs(means[0].mean(axis=0)) + STANDARD_ERRORS * noise)[counts].all()
     assert (noise < 0.01 * np.abs(means[0].mean(axis=0)))[counts & (np.arange(len(counts)) == 0)].all()
+
+
+def test_spots_that_lamps_light_from_close_by_are_counted_once():
+    walls = build_scenes.box((0, 0, 0), (3, 3, 2.5), inward=True)
+    lamp = {"kind": LightKind.POINT, "position": (0.04, 1.5, 1.2), "strength": (4, 4, 4), "size": (0.01, 0)}
+    scene = prepare(build_scenes.snapshot([(walls, matte(0.5))], build_scenes.lamps(lamp)), Model())
+    assert scene.lit_spots.count == 1
+    rng = np.random.default_rng(5)
+    position = np.ascontiguousarray(rng.uniform(0.02, (2.98, 2.98, 2.48), (200, 3)).T.astype(np.float32))
+    paths, cache = ([], [])
+    for seed in range(2 * SEEDS):
+        cached = with_cache(scene, dataclasses.replace(EFFORT, seed=seed))
+        paths.append(measured(scene, position, seed)[:, 0].mean())
+        cache.append(measured(cached, position, seed + 100)[:, 0].mean())
+    assert cached.cache.known.uneven.any()
+    noise = np.hypot(standard_error(np.array(paths)), standard_error(np.array(cache)))
+    assert noise < 2 * BIAS * np.mean(paths)
+    assert abs(np.mean(cache) - np.mean(paths)) < BIAS * np.mean(paths) + STANDARD_ERRORS * noise
 
 
 def test_the_cache_is_less_noisy_than_paths():

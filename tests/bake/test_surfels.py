@@ -79,7 +79,9 @@ def test_paths_end_by_how_far_they_came_and_go_on_where_nothing_is_known():
     table = Table(LATTICE.keys(position[:, :1], normal[:, :1])[0])
     light = np.arange(1, 13, dtype=np.float32).reshape(1, 4, 3)
     floor = Tracer(build_scenes.plane(9.0).astype(np.float32), np.zeros(2, bool))
-    cache = Surfels(Known(LATTICE, table, position[:, :1] + 0.1, np.zeros(1, bool), floor), light, light / 2)
+    none = np.zeros(1, bool)
+    known = Known(LATTICE, table, position[:, :1] + 0.1, none, none, floor)
+    cache = Surfels(known, light, light / 2)
     beta, reflectance = np.full((3, 4), 0.5, np.float32), np.full((3, 4), 0.25, np.float32)
     lane = np.array([3, 0, 2, 1])
     wave = Wave(lane, position, normal, beta, np.ones(4, np.float32))
@@ -100,10 +102,10 @@ def test_hits_that_do_not_see_the_middle_of_a_crowded_cube_are_not_of_its_surfel
     position, normal = columns(here, there), np.tile(columns((0, 0, 1)), 2)
     wall = build_scenes.quad((1.15, 0, 0), (1.15, 3, 0), (1.15, 3, 3), (1.15, 0, 3)).astype(np.float32)
     table = Table(LATTICE.keys(position[:, :1], normal[:, :1])[0])
-    vertex = Vertex(np.zeros(2, np.int32), position, normal, np.ones((3, 2), np.float32))
     for crowded, expected in ((True, [0, NONE]), (False, [0, 0])):
-        known = Known(LATTICE, table, columns((1.1, 1.15, 1.06)), np.array([crowded]), Tracer(wall, np.zeros(2, bool)))
-        assert known.which(vertex, np.full(2, 5, np.float32))[0].tolist() == expected
+        flags, tracer = (np.array([crowded]), np.zeros(1, bool)), Tracer(wall, np.zeros(2, bool))
+        known = Known(LATTICE, table, columns((1.1, 1.15, 1.06)), *flags, tracer)
+        assert known.which(position, normal, np.full(2, 5, np.float32))[0].tolist() == expected
 
 
 def test_cubes_are_crowded_where_surfaces_meet():
@@ -111,3 +113,15 @@ def test_cubes_are_crowded_where_surfaces_meet():
     keys = np.array([key(*place) for place in places])
     order = np.argsort(keys)
     assert are_crowded(keys[order])[np.argsort(order)].tolist() == [True, True, False]
+
+
+def test_direct_light_is_looked_for_on_uneven_surfels_from_any_distance():
+    position, normal = columns((1.1, 1.15, 1.0)), columns((0, 0, 1))
+    table, nothing = (
+        Table(LATTICE.keys(position, normal)[0]),
+        Tracer(np.zeros((0, 3, 3), np.float32), np.zeros(0, bool)),
+    )
+    for uneven in (False, True):
+        known = Known(LATTICE, table, position, np.zeros(1, bool), np.array([uneven]), nothing)
+        number, near = known.which(position, normal, np.full(1, 50, np.float32))
+        assert (number.tolist(), near.tolist()) == ([0], [uneven])
