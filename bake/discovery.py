@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import zip_longest
 
 import numpy as np
 
@@ -25,8 +26,11 @@ __all__ = ["Places", "Spending", "find", "numbers", "tiles", "vertex"]
 FINDERS, EACH = 1 << 20, (16, 256)
 """Paths that look for surfels, and the fewest and most from each receiver."""
 
-FOUND_BOUNCES = 2
+FOUND_BOUNCES = 1
 """Reflections of those paths."""
+
+MET = 64
+"""Hits on a surfel without which others may share its cube unseen."""
 
 OPEN = np.float32(1 / 4)
 """Height above a surfel that what belongs to it must see [cubes]."""
@@ -52,7 +56,7 @@ class Places:
 
     key : (n,) int64, ascending
     middle : (3, n) float32 [m], a little above one hit of each, which all of its places see
-    crowded : (n,) bool, whether other surfels share its cube
+    crowded : (n,) bool, whether other surfels share its cube, or may, as few paths have been there
     position, normal : (3, n * places) float32, hits on each, one surfel's after another's
     """
 
@@ -114,7 +118,8 @@ def find(
     known, count = np.unique(key[order], return_counts=True)
     rows = order[(np.cumsum(count) - count)[:, None] + np.arange(spending.places) * count[:, None] // spending.places]
     some, chosen = np.searchsorted(used, known), rows.reshape(-1)
-    return lattice, Places(known, above[:, some], are_crowded(used)[some], position[:, chosen], normal[:, chosen])
+    crowded = are_crowded(used)[some] | (count < MET)
+    return lattice, Places(known, above[:, some], crowded, position[:, chosen], normal[:, chosen])
 
 
 def tiles(count: int, size: int) -> list[np.ndarray]:
@@ -179,8 +184,11 @@ class _Finder:
     def finish(self, wave: Wave, vertex: Vertex, travelled: np.ndarray, light: Radiance) -> tuple:
         self.position.append(vertex.position.copy())
         self.normal.append(vertex.normal.copy())
-        rows = np.arange(len(travelled))
+        rows = np.arange(len(travelled) if len(self.position) <= FOUND_BOUNCES else 0)
         return rows, rows
+
+    def leaves(self, position: np.ndarray, normal: np.ndarray, travelled: np.ndarray) -> np.ndarray:
+        return np.arange(len(travelled))
 
 
 def _met(scene: Scene, at: Receivers, effort: Effort, show: Callable[[float], bool]) -> tuple[np.ndarray, np.ndarray]:
@@ -196,13 +204,18 @@ def _met(scene: Scene, at: Receivers, effort: Effort, show: Callable[[float], bo
         lane = np.repeat(tile, finders)
         begin = vertex(start[:, lane], normal[:, lane])
         random = numbers(at.key[tile], effort.seed, 0, finders)
-        paths.arriving(dark, begin, random, 1 + FOUND_BOUNCES, found[tile[0] // size])
+        paths.arriving(dark, begin, random, 2 + FOUND_BOUNCES, found[tile[0] // size])
         return len(tile)
 
     run_tiles(work, parts, effort.threads, lambda done: show(done / len(at.key)))
-    empty = [np.zeros((3, 0), np.float32)]
-    position = np.concatenate(empty + [part for finder in found for part in finder.position], axis=1)
-    return position, np.concatenate(empty + [part for finder in found for part in finder.normal], axis=1)
+    return _by_bounce([finder.position for finder in found]), _by_bounce([finder.normal for finder in found])
+
+
+def _by_bounce(parts: list[list[np.ndarray]]) -> np.ndarray:
+    """(3, n) what tiles found, bounce after bounce, so that the order does not depend on the tiles."""
+    empty = np.zeros((3, 0), np.float32)
+    ordered = [part for bounce in zip_longest(*parts, fillvalue=empty) for part in bounce]
+    return np.concatenate([empty, *ordered], axis=1)
 
 
 def _in_the_dark(scene: Scene) -> Scene:

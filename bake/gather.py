@@ -96,7 +96,7 @@ def gather(
     Returns
     -------
     Gathered
-        Unbiased up to the bounce limit.
+        Unbiased up to the bounce limit, where the scene has no cache.
 
     Raises
     ------
@@ -230,7 +230,7 @@ def _direct(scene: Scene, sensor: Sensor, position, rows, numbers: Numbers, lane
     if scene.model.local and scene.lit_spots.count and bounces:
         u = numbers.draw(lanes, DIRECT_DIMENSIONS + 10, lit_spots.NUMBERS)
         ends = paths.passing(numbers, lanes, 0)
-        some, toward, radiance, density = paths.spots(scene, position, u, ends)
+        some, toward, radiance, density = paths.spots(scene, position, u, ends, scene.cache)
         direction = _unit(toward)
         value = radiance / (density + sensor.pdf(rows[some], direction))
         seen, tint = unblocked(scene, position[:, some], toward, TARGET_SHORTENED, density > 0)

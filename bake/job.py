@@ -49,6 +49,9 @@ BUDGET_MARGIN = 0.97
 CACHED = 0.1
 """Part of a cell's progress that its surface cache takes."""
 
+WORTH = 1 << 20
+"""Paths that a cell is expected to take, below which they are followed to their end: finding surfels takes as many."""
+
 STEPS = 1000
 """Units of progress in a cell."""
 
@@ -190,9 +193,13 @@ class _Work:
     shared: list[Scene] = field(default_factory=list)
 
     def light_in(self, cell: Outline, show: Callable[[float], bool]) -> Scene:
-        """The scene, with a surface cache if there is to be one: of a scene no larger than a cell the same for all."""
-        if self.settings.method != "cache" or self.shared:
-            return self.shared[0] if self.shared else self.scene
+        """The scene, with a surface cache if there is to be one, and it is worth the paths that it takes: of a scene no
+        larger than a cell the same for all."""
+        expected = self.settings.samples * sum(len(coords) for coords in cell.coords)
+        if self.settings.method != "cache" or expected < WORTH:
+            return self.scene
+        if self.shared:
+            return self.shared[0]
         bounds, small = (
             self.scene.soup.bounds,
             np.ptp(self.scene.soup.bounds[:, :2], axis=0).max() <= self.grid.cell_size,

@@ -1,7 +1,8 @@
 """The path tracer: wavefronts of paths that carry all three transports at once.
 
 Comes in: rays and their random numbers. Goes out: for each ray the radiance that comes back along it, apart for
-local light, for every sun key and for every function of the sky. Unbiased but for the bounce limit.
+local light, for every sun key and for every function of the sky. Unbiased but for the bounce limit, and the surface cache
+where the scene has one.
 """
 
 from __future__ import annotations
@@ -193,7 +194,7 @@ def trace(scene: Scene, wave: Wave, numbers: Numbers, bounces: int) -> Radiance:
     -------
     Radiance
         Direct light of lamps and suns along the rays is not part of it: they are no surfaces. Where the scene has
-        `lit_spots`, what paths find of them at their first hit is weighed against `LitSpots.sample` at their start,
+        `lit_spots`, what paths find of them at their first hit is weighed against `spots` at their start,
         which is the caller's to add.
 
     Notes
@@ -206,7 +207,7 @@ def trace(scene: Scene, wave: Wave, numbers: Numbers, bounces: int) -> Radiance:
     return light
 
 
-def shine(scene: Scene, vertex: Vertex, numbers: Numbers) -> Radiance:
+def shine(scene: Scene, vertex: Vertex, numbers: Numbers) -> tuple[Radiance, np.ndarray]:
     """Direct light on surfaces, of all that can be looked for there; emitters and a sky that paths find by chance
     are weighed against that.
 
@@ -221,13 +222,18 @@ def shine(scene: Scene, vertex: Vertex, numbers: Numbers) -> Radiance:
 
     Returns
     -------
-    Radiance
+    light : Radiance
         Irradiance there [W/m2], where the reflectance is pi.
+    of_lamps : (3, n) float32 ndarray
+        What of its local light comes from lamps.
     """
     light = Radiance.zeros(scene, len(vertex.triangle))
     travelled = np.zeros(len(vertex.triangle), np.float32)
-    _shine(scene, _leaving(vertex), vertex, numbers, 0, travelled, light)
-    return light
+    wave = _leaving(vertex)
+    _add_lamps(scene, wave, vertex, numbers, 0, travelled, light)
+    of_lamps = light.local.copy()
+    _shine(scene, wave, vertex, numbers, 0, light)
+    return light, of_lamps
 
 
 def arriving(scene: Scene, vertex: Vertex, numbers: Numbers, bounces: int, cache: Cache) -> Radiance:
@@ -236,7 +242,7 @@ def arriving(scene: Scene, vertex: Vertex, numbers: Numbers, bounces: int, cache
     Parameters
     ----------
     scene : Scene
-        What they travel through; without lit spots.
+        What they travel through.
     vertex : Vertex
         Points on surfaces, one for each lane.
     numbers : Numbers
@@ -252,7 +258,10 @@ def arriving(scene: Scene, vertex: Vertex, numbers: Numbers, bounces: int, cache
         Irradiance there [W/m2], where the reflectance is pi.
     """
     light = Radiance.zeros(scene, len(vertex.triangle))
-    _follow(scene, _scatter(_leaving(vertex), vertex, numbers, 0), numbers, (1, bounces), light, cache)
+    wave = _leaving(vertex)
+    if bounces > 1:
+        _add_lit_spots(scene, wave, vertex, numbers, (0, cache), light)
+    _follow(scene, _scatter(wave, vertex, numbers, 0), numbers, (1, bounces), light, cache)
     return light
 
 
@@ -263,7 +272,9 @@ def _leaving(vertex: Vertex) -> Wave:
     return Wave(np.arange(count), vertex.position, ones, ones.copy(), np.ones(count, np.float32))
 
 
-def _follow(scene: Scene, wave: Wave, numbers: Numbers, limits: tuple[int, int], light: Radiance, cache) -> None:
+def _follow(
+    scene: Scene, wave: Wave, numbers: Numbers, limits: tuple[int, int], light: Radiance, cache: Cache | None
+) -> None:
     """Follow paths from one vertex to another, these included."""
     first, last = limits
     for bounce in range(first, last + 1):
@@ -278,17 +289,17 @@ def _follow(scene: Scene, wave: Wave, numbers: Numbers, limits: tuple[int, int],
         if cache is not None:
             left, on = cache.finish(wave, vertex, travelled, light)
             wave, vertex, travelled = wave.take(left), vertex.take(left), travelled[left]
-        _shine(scene, wave, vertex, numbers, bounce, travelled, light)
+        _add_lamps(scene, wave, vertex, numbers, bounce, travelled, light)
+        _shine(scene, wave, vertex, numbers, bounce, light)
         if on is not None:
             wave, vertex = wave.take(on), vertex.take(on)
         if bounce + 1 < last:
-            _add_lit_spots(scene, wave, vertex, numbers, bounce, light)
+            _add_lit_spots(scene, wave, vertex, numbers, (bounce, cache), light)
         wave = _scatter(wave, vertex, numbers, bounce)
 
 
-def _shine(scene: Scene, wave: Wave, vertex: Vertex, numbers: Numbers, bounce: int, travelled, light) -> None:
-    """Look for light at vertices: lamps, emitters, suns, an uneven sky."""
-    _add_lamps(scene, wave, vertex, numbers, bounce, travelled, light)
+def _shine(scene: Scene, wave: Wave, vertex: Vertex, numbers: Numbers, bounce: int, light: Radiance) -> None:
+    """Look for light at vertices besides that of lamps: emitters, suns, an uneven sky."""
     _add_emitters(scene, wave, vertex, numbers, bounce, light)
     _add_suns(scene, wave, vertex, numbers, bounce, light)
     _add_sky(scene, wave, vertex, numbers, bounce, light)
@@ -409,13 +420,14 @@ def _add_lamps(scene: Scene, wave, vertex: Vertex, numbers: Numbers, bounce: int
     _collect(light.local, wave, vertex, rows, sample.irradiance[:, rows] * weight * tint)
 
 
-def _add_lit_spots(scene: Scene, wave: Wave, vertex: Vertex, numbers: Numbers, bounce: int, light: Radiance) -> None:
+def _add_lit_spots(scene: Scene, wave: Wave, vertex: Vertex, numbers: Numbers, when: tuple, light: Radiance) -> None:
     """One shadow ray from some paths to what a lamp's ray meets, weighed against finding it by chance."""
     if not scene.model.local or not scene.lit_spots.count:
         return
+    bounce, cache = when
     u = numbers.draw(wave.lane, HASHED + bounce * HASHED_PER_VERTEX + SPOT, lit_spots.NUMBERS)
     ends = passing(numbers, wave.lane, bounce + 1)  # as the path's own next leg: what either brings is only added
-    some, toward, radiance, density = spots(scene, vertex.position, u, ends)
+    some, toward, radiance, density = spots(scene, vertex.position, u, ends, cache)
     position, normal = vertex.position[:, some], vertex.normal[:, some]
     length = np.sqrt(warp.dot(toward, toward))
     cosine = np.maximum(warp.dot(toward, normal), 0) / np.maximum(length, np.float32(1e-30))
@@ -424,7 +436,7 @@ def _add_lit_spots(scene: Scene, wave: Wave, vertex: Vertex, numbers: Numbers, b
     _collect(light.local, wave, vertex, some[rows], value[:, rows] * tint)
 
 
-def spots(scene: Scene, position: np.ndarray, u: tuple[np.ndarray, ...], ends) -> tuple[np.ndarray, ...]:
+def spots(scene: Scene, position: np.ndarray, u: tuple[np.ndarray, ...], ends, cache: Cache | None) -> tuple:
     """Ways to lit spots; those whose light a cache brings to paths are left out.
 
     Parameters
@@ -433,6 +445,8 @@ def spots(scene: Scene, position: np.ndarray, u: tuple[np.ndarray, ...], ends) -
         With lit spots.
     position, u, ends
         As for `LitSpots.sample`.
+    cache : Cache, optional
+        What ends paths.
 
     Returns
     -------
@@ -440,9 +454,9 @@ def spots(scene: Scene, position: np.ndarray, u: tuple[np.ndarray, ...], ends) -
         As of `LitSpots.sample`.
     """
     some, toward, radiance, density, normal = scene.lit_spots.sample(position, u, ends)
-    if scene.cache is None:
+    if cache is None:
         return some, toward, radiance, density
-    kept = scene.cache.leaves(position[:, some] + toward, normal, np.sqrt(warp.dot(toward, toward)))
+    kept = cache.leaves(position[:, some] + toward, normal, np.sqrt(warp.dot(toward, toward)))
     return some[kept], toward[:, kept], radiance[:, kept], density[kept]
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..tree.grid import Grid
 from . import paths, receivers, warp
-from .discovery import OPEN, Places, Spending, find, numbers, tiles, vertex
+from .discovery import Places, Spending, find, numbers, tiles, vertex
 from .gather import TILE_LANES, Effort, run_tiles
 from .lamps import luminance
 from .lit_spots import LitSpots
@@ -36,16 +36,15 @@ FOUND = 0.3
 BLOCK = 1 << 20
 """Numbers that are read at a time."""
 
-UNEVEN = 0.2
+UNEVEN = 0.1
 """Standard deviation of the mean direct light of lamps on a surfel, relative to it, above which paths look for that
-light themselves, with the help of lit spots. An edge through the middle of 16 places has 0.25; a lamp a sixth of a cube
-off a wall as much, though none of them may lie in its spot."""
+light themselves, with the help of lit spots. An edge through the middle of 16 places has 0.25, at a tenth 0.08."""
 
-MANY = 256
-"""Places where these are lit directly."""
+BEAMS, MOST_BEAMS = 1 << 10, 1 << 18
+"""Rays from each lamp, and from all, that look for what it lights."""
 
 LEFT = 1e-4
-"""Light that is still under way when the bounces end, in all light."""
+"""Light that is still under way when the bounces end, on every surfel and of every function, in what arrived there."""
 
 CUBES = 32
 """Least cubes along a first-level voxel: 0.25 m at human scale."""
@@ -94,14 +93,12 @@ def cached(
     Error: light is even over a surfel, as the receivers' paths see it; see `docs/accuracy.md`.
     Source: Arvo and Kirk 1990; Christensen 2008, "Point-based approximate global illumination".
     """
-    spots = LitSpots(scene.lamps, scene.tracer, scene.surfaces, wanted=False)
-    whole, scene = scene, dataclasses.replace(scene, lit_spots=spots, cache=None)
+    scene = dataclasses.replace(scene, cache=None)
     show = progress or (lambda share: True)
     lattice, places = find(scene, at, lattice, effort, spending, lambda share: show(FOUND * share))
     work = _Work(scene, lattice, places, effort, spending)
     work.run(lambda share: show(FOUND + (1 - FOUND) * share))
-    known = dataclasses.replace(work.known, uneven=work.uneven)
-    return dataclasses.replace(whole, cache=Surfels(known, *_solve(work)))
+    return dataclasses.replace(scene, cache=Surfels(work.known, *_solve(work)))
 
 
 def around(
@@ -156,6 +153,9 @@ class _Recorder:
         left = np.flatnonzero((number < 0) | near)
         return left, np.flatnonzero(number[left] < 0)
 
+    def leaves(self, position: np.ndarray, normal: np.ndarray, travelled: np.ndarray) -> np.ndarray:
+        return self.known.leaves(position, normal, travelled)
+
 
 class _Work:
     """Everything that rays are traced for, surfel by surfel."""
@@ -163,62 +163,62 @@ class _Work:
     def __init__(self, scene: Scene, lattice: Lattice, places: Places, effort: Effort, spending: Spending) -> None:
         self.scene, self.places, self.effort, self.spending = scene, places, effort, spending
         count, functions = len(places.key), 1 + len(scene.model.suns.toward) + scene.model.sky_count
-        self.uneven = np.zeros(count, bool)
-        self.known = Known(lattice, Table(places.key), places.middle, places.crowded, self.uneven.copy(), scene.tracer)
+        self.uneven, self.dark = np.zeros((2, count), bool)
+        spots = LitSpots(scene.lamps, scene.tracer, scene.surfaces, wanted=False)
+        self.without_spots = dataclasses.replace(scene, lit_spots=spots)
+        self.known = Known(lattice, Table(places.key), places.middle, places.crowded, self.uneven, scene.tracer)
         self.direct, self.found = np.zeros((2, 3, count, functions), np.float32)
         self.number = np.zeros((count, spending.rays), np.int32)
         self.near = np.zeros((count, spending.rays), bool)
         self.weight = np.zeros((3, count, spending.rays), np.float32)
 
     def run(self, show: Callable[[float], bool]) -> None:
-        """Trace in tiles."""
+        """Trace in tiles: direct light everywhere, then rays, for which it matters where that is uneven."""
         count = len(self.places.key)
-        parts = tiles(count, TILE_LANES // self.spending.rays)
-        run_tiles(self.light, parts, self.effort.threads, lambda done: show(done / count))
-        rows = np.flatnonzero(self.uneven)
-        run_tiles(self.look_closer, [rows[part] for part in tiles(len(rows), TILE_LANES // MANY)], self.effort.threads)
+        for stage, (work, lanes) in enumerate(((self.light, self.spending.places), (self.send, self.spending.rays))):
+            parts = tiles(count, max(1, TILE_LANES // lanes))
+            run_tiles(work, parts, self.effort.threads, lambda done, stage=stage: show((stage + done / count) / 2))
+            self.uneven[self.lit_unseen() if stage == 0 else []] = True
+            self.known = dataclasses.replace(self.known, uneven=self.uneven)
+
+    def lit_unseen(self) -> np.ndarray:
+        """(m,) surfels that lamps shine on, though none of their places is lit: beams that are narrower than they."""
+        lamps = self.scene.lamps
+        if not (self.scene.has_local and lamps.count):
+            return np.zeros(0, np.int64)
+        lamp = np.repeat(np.arange(lamps.count), max(1, min(BEAMS, MOST_BEAMS // lamps.count)))
+        keys = scramble(lamp.astype(np.uint32), self.effort.seed & 0xFFFFFFFF)
+        random = numbers(scramble(np.arange(len(lamp), dtype=np.uint32), 5) ^ keys, self.effort.seed, 3, 1)
+        start, direction = (np.array(part) for part in lamps.emit(lamp, random.draw(np.arange(len(lamp)), 0, 4)))
+        hits = self.scene.tracer.intersect(start, direction)
+        met = np.flatnonzero(hits.triangle != MISS)
+        place = start[:, met] + direction[:, met] * hits.distance[met]
+        length = np.sqrt(warp.dot(hits.normal, hits.normal))[met]
+        normal = hits.normal[:, met] * (-np.sign(warp.dot(hits.normal, direction))[met] / length)
+        number = self.known.table.find(self.known.lattice.keys(place, normal)[0])
+        number = np.unique(number[number >= 0])
+        return number[self.dark[number]]
 
     def light(self, rows: np.ndarray) -> int:
-        """Direct light of some surfels, and where their rays end."""
-        places, rays = self.spending.places, self.spending.rays
-        near, far = (self.numbers(rows, 1 + k, count) for k, count in enumerate((places, rays)))
-        direct = paths.shine(self.scene, self.at(rows, places), near)
+        """Direct light of some surfels."""
+        places = self.spending.places
+        direct, of_lamps = paths.shine(self.without_spots, self.at(rows, places), self.numbers(rows, 1, places))
+        self.direct[:, rows] = _mean(direct, places)
+        seen = luminance(of_lamps).reshape(-1, places)
+        self.uneven[rows], self.dark[rows] = _is_uneven(seen), ~seen.any(axis=1)
+        return len(rows)
+
+    def send(self, rows: np.ndarray) -> int:
+        """Rays from some surfels: what they find by chance, and where they end."""
+        rays = self.spending.rays
         recorder = _Recorder(self.known, len(rows) * rays)
-        chance = paths.arriving(self.scene, self.at(rows, rays), far, self.effort.bounces, recorder)
-        for target, part, count in (self.direct, direct, places), (self.found, chance, rays):
-            target[:, rows] = _stacked(part, count).mean(axis=3).transpose(1, 2, 0)
+        numbers = self.numbers(rows, 2, rays)
+        found = paths.arriving(self.scene, self.at(rows, rays), numbers, self.effort.bounces, recorder)
+        self.found[:, rows] = _mean(found, rays)
         self.number[rows] = recorder.number.reshape(-1, rays)
         self.near[rows] = recorder.near.reshape(-1, rays)
-        self.uneven[rows] = _is_uneven(luminance(direct.local).reshape(-1, places))
         self.weight[:, rows] = recorder.weight.reshape(3, -1, rays) / np.float32(rays)
         return len(rows)
-
-    def look_closer(self, rows: np.ndarray) -> int:
-        """Direct light of uneven surfels again, at many places all over them: as many as their middle sees."""
-        lane, random = np.repeat(rows, MANY), self.numbers(rows, 3, MANY)
-        position, facing, on = self.beneath(lane, random.draw(np.arange(len(lane)), 0, 2))
-        light = _stacked(paths.shine(self.scene, vertex(position, facing), random), MANY)
-        on = on.reshape(-1, MANY)
-        mean = (light * on).sum(axis=3) / np.maximum(on.sum(axis=1), 1)
-        enough = on.sum(axis=1) >= self.spending.places
-        self.direct[:, rows[enough]] = mean[:, :, enough].transpose(1, 2, 0)
-        return len(rows)
-
-    def beneath(self, lane: np.ndarray, u: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(3, n) places and normals that surfels' middles see around them, and (n,) whether they belong to the surfel;
-        a place that is known where they do not."""
-        start, first = self.places.middle[:, lane], lane * self.spending.places
-        known, normal = self.places.position[:, first], self.places.normal[:, first]
-        size = self.known.lattice.keys(known, normal)[1]
-        right, up = warp.frame(normal)
-        way = (right * (2 * u[0] - 1) + up * (2 * u[1] - 1) - normal * OPEN) * size
-        hits = self.scene.tracer.intersect(start, way)
-        length = np.sqrt(warp.dot(hits.normal, hits.normal))
-        facing = hits.normal * (-np.sign(warp.dot(hits.normal, way)) / np.maximum(length, np.float32(1e-37)))
-        place = start + way * np.where(hits.triangle == MISS, np.float32(0), hits.distance)
-        place += facing * self.scene.tracer.offset(place, size)
-        on = (hits.triangle != MISS) & (self.known.lattice.keys(place, facing)[0] == self.places.key[lane])
-        return np.where(on, place, known), np.where(on, facing, normal), on
 
     def numbers(self, rows: np.ndarray, stage: int, count: int) -> Numbers:
         """Random numbers of surfels, `count` lanes for each."""
@@ -231,10 +231,10 @@ class _Work:
         return vertex(self.places.position[:, place], self.places.normal[:, place])
 
 
-def _stacked(light: Radiance, count: int) -> np.ndarray:
-    """(functions, 3, n, count) light of `count` lanes for each surfel."""
+def _mean(light: Radiance, count: int) -> np.ndarray:
+    """(3, n, functions) mean over `count` lanes for each surfel."""
     stacked = np.concatenate([light.local[None], light.sun, light.sky])
-    return stacked.reshape(*stacked.shape[:2], -1, count)
+    return stacked.reshape(*stacked.shape[:2], -1, count).mean(axis=3).transpose(1, 2, 0)
 
 
 def _is_uneven(light: np.ndarray) -> np.ndarray:
@@ -251,7 +251,7 @@ def _solve(work: _Work) -> tuple[np.ndarray, np.ndarray]:
     for _ in range(work.effort.bounces - 1):
         last = _passed(work, last)
         total = total + last
-        if np.abs(last).sum() <= LEFT * np.abs(total).sum():
+        if (np.abs(last).sum(axis=0) <= LEFT * np.abs(total).sum(axis=0)).all():
             break
     return tuple(np.ascontiguousarray(part.transpose(1, 2, 0)) for part in (total, total - work.direct))
 

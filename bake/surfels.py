@@ -46,8 +46,8 @@ those shorter than the second go on from there."""
 LOAD = 4
 """Slots of the table for each surfel."""
 
-SPREAD = np.uint64(0x9E3779B97F4A7C15)
-"""Golden ratio times 2**64: spreads keys over the table (Knuth, volume 3, 6.4)."""
+SPREAD = np.int64(0x9E3779B97F4A7C15 - (1 << 64))
+"""Golden ratio times 2**64, modulo that: spreads keys over the table (Knuth, volume 3, 6.4)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +151,7 @@ class Table:
 
     def __init__(self, keys: np.ndarray) -> None:
         bits = max(4, int(np.ceil(np.log2(max(len(keys), 1) * LOAD))))
-        self._shift, self._mask = np.uint64(64 - bits), (1 << bits) - 1
+        self._shift, self._mask = 64 - bits, (1 << bits) - 1
         self._key, self._number = np.full(1 << bits, NONE, np.int64), np.full(1 << bits, NONE, np.int32)
         number, slot = np.arange(len(keys)), self._first(keys)
         while len(number):
@@ -192,7 +192,7 @@ class Table:
 
     def _first(self, keys: np.ndarray) -> np.ndarray:
         """(n,) int64 slots where to look first."""
-        return (keys.view(np.uint64) * SPREAD >> self._shift).astype(np.int64)
+        return keys * SPREAD >> self._shift & self._mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,6 +241,24 @@ class Known:
         number[crowd[~seen]] = NONE
         return number, near
 
+    def leaves(self, position: np.ndarray, normal: np.ndarray, travelled: np.ndarray) -> np.ndarray:
+        """Say for which paths direct light is still to be looked for.
+
+        Parameters
+        ----------
+        position, normal : (3, n) float32 ndarray
+            Where paths are [m], and unit normals towards where they came from.
+        travelled : (n,) float32 ndarray
+            Length of their last leg [m].
+
+        Returns
+        -------
+        (m,) int64 ndarray
+            Rows of `position`.
+        """
+        number, near = self.which(position, normal, travelled)
+        return np.flatnonzero((number < 0) | near)
+
 
 @dataclass(frozen=True, eq=False)
 class Surfels:
@@ -257,7 +275,26 @@ class Surfels:
     indirect: np.ndarray
 
     def finish(self, wave: Wave, vertex: Vertex, travelled: np.ndarray, light: Radiance) -> tuple:
-        """End paths on surfels, with the light that these reflect; see `paths.Cache`."""
+        """End paths on surfels, with the light that these reflect.
+
+        Parameters
+        ----------
+        wave : Wave
+            Paths.
+        vertex : Vertex
+            Where they are.
+        travelled : (n,) float32 ndarray
+            Length of their last leg [m].
+        light : Radiance
+            What they bring is added here.
+
+        Returns
+        -------
+        left : (m,) int64 ndarray
+            Rows of the paths for which direct light is still to be looked for.
+        on : (k,) int64 ndarray
+            Which of these go on after that.
+        """
         number, near = self.known.which(vertex.position, vertex.normal, travelled)
         for rows, source in ((number >= 0) & ~near, self.light), ((number >= 0) & near, self.indirect):
             rows = np.flatnonzero(rows)
@@ -267,9 +304,21 @@ class Surfels:
         return left, np.flatnonzero(number[left] < 0)
 
     def leaves(self, position: np.ndarray, normal: np.ndarray, travelled: np.ndarray) -> np.ndarray:
-        """Say for which paths direct light is still to be looked for; see `paths.Cache`."""
-        number, near = self.known.which(position, normal, travelled)
-        return np.flatnonzero((number < 0) | near)
+        """Say for which paths direct light is still to be looked for, as `Known.leaves`.
+
+        Parameters
+        ----------
+        position, normal : (3, n) float32 ndarray
+            Where paths are [m], and unit normals towards where they came from.
+        travelled : (n,) float32 ndarray
+            Length of their last leg [m].
+
+        Returns
+        -------
+        (m,) int64 ndarray
+            Rows of `position`.
+        """
+        return self.known.leaves(position, normal, travelled)
 
 
 def _add(light: Radiance, lane: np.ndarray, factor: np.ndarray, found: np.ndarray) -> None:

@@ -21,7 +21,7 @@ from statistics_checks import SIGNIFICANCE, standard_error
 
 CELLS = [(-1, -1), (-1, 0), (0, -1), (0, 0)]
 QUICK = Settings(samples=16, bounces=2, error=0.15)
-WORDS = ("--samples", "16", "--bounces", "2", "--error", "0.15", "--threads", "1")
+WORDS = ("--samples", "16", "--bounces", "2", "--error", "0.15", "--threads", "1", "--method", "paths")
 """QUICK, as the command line says it."""
 
 STEP = 1e-4

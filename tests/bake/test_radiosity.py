@@ -8,7 +8,7 @@ import build_scenes
 import numpy as np
 import pytest
 from command_line import cells_only
-from gi_volumes.bake import job, radiosity, reference
+from gi_volumes.bake import discovery, job, radiosity, reference
 from gi_volumes.bake.gather import CancelledError, Effort, gather
 from gi_volumes.bake.scene import Model, Scene, SunDirections, prepare
 from gi_volumes.bake.sensors import HarmonicsSensor
@@ -64,11 +64,11 @@ def room(sky: str = "fixed") -> Scene:
 
 
 def measured(scene: Scene, position: np.ndarray, seed: int) -> np.ndarray:
-    """(points, functions) mean irradiance around points, over colours."""
+    """(points, functions * 3) mean irradiance around points."""
     keys = np.arange(position.shape[1], dtype=np.uint32)
     found = gather(scene, HarmonicsSensor(), position, keys, dataclasses.replace(EFFORT, seed=seed))
     parts = [part for part in (found.local[:, None], found.sun, found.sky) if len(part)]
-    return np.concatenate(parts, axis=1)[:, :, 0].mean(axis=2)
+    return np.concatenate(parts, axis=1)[:, :, 0].reshape(position.shape[1], -1)
 
 
 def free_points(count: int) -> np.ndarray:
@@ -113,9 +113,11 @@ def test_means_of_all_transports_are_those_of_paths(sky):
     noise = np.hypot(*(standard_error(found) for found in means))
     off = np.abs(means[1].mean(axis=0) - means[0].mean(axis=0))
     counts = np.abs(means[0].mean(axis=0)) > 0.05 * bright
-    assert counts.sum() >= 3
+    assert counts.sum() >= 9
     assert (off < BIAS * np.abs(means[0].mean(axis=0)) + STANDARD_ERRORS * noise)[counts].all()
-    assert (noise < 0.01 * np.abs(means[0].mean(axis=0)))[counts & (np.arange(len(counts)) == 0)].all()
+    swapped = means[1].mean(axis=0).reshape(-1, 3)[:, ::-1].reshape(-1)
+    planted = np.abs(swapped - means[0].mean(axis=0))
+    assert (planted > BIAS * np.abs(means[0].mean(axis=0)) + STANDARD_ERRORS * noise)[counts].sum() >= 4
 
 
 def test_spots_that_lamps_light_from_close_by_are_counted_once():
@@ -157,8 +159,12 @@ def test_no_light_comes_through_a_wall_that_cuts_through_cubes(thickness):
     assert reference.at(scene, points, normals, EFFORT).local.min() > 0
 
 
-def test_the_cache_is_the_same_for_any_number_of_threads():
-    one, two = (with_cache(room(), dataclasses.replace(EFFORT, threads=threads)).cache for threads in (1, 3))
+def test_the_cache_is_the_same_for_any_number_of_threads_and_any_tiles(monkeypatch):
+    one = with_cache(room(), dataclasses.replace(EFFORT, threads=1)).cache
+    for module in (discovery, radiosity):
+        monkeypatch.setattr(module, "TILE_LANES", 1 << 13)
+    two = with_cache(room(), dataclasses.replace(EFFORT, threads=3)).cache
+    assert len(one.light) > 3 * ((1 << 13) // radiosity.Spending().rays)
     assert one.light.tobytes() == two.light.tobytes()
     assert one.indirect.tobytes() == two.indirect.tobytes()
 
@@ -166,7 +172,7 @@ def test_the_cache_is_the_same_for_any_number_of_threads():
 def test_a_scene_of_more_surfels_than_are_allowed_gets_larger_cubes(monkeypatch):
     scene = room()
     fine = with_cache(scene).cache
-    few = dataclasses.replace(radiosity.Spending(), surfels=len(fine.light) // 3)
+    few = radiosity.Spending(surfels=len(fine.light) // 3)
     monkeypatch.setattr(radiosity, "Spending", lambda: few)
     coarse = with_cache(scene).cache
     assert len(coarse.light) <= few.surfels
@@ -182,14 +188,16 @@ def test_a_scene_that_nobody_sees_has_no_surfels_and_its_paths_go_on():
     assert (measured(cached, position, 1) == measured(scene, position, 1)).all()
 
 
-def test_filling_a_cache_can_be_stopped_at_any_time():
+def test_filling_a_cache_can_be_stopped_at_any_time(monkeypatch):
     calls = []
+    for module in (discovery, radiosity):
+        monkeypatch.setattr(module, "TILE_LANES", 1 << 13)
 
     def show(share: float) -> bool:
         calls.append(share)
         return len(calls) < stop
 
-    for stop in (1, 2, 1 << 30):
+    for stop in (1, 5, 12, 1 << 30):
         calls.clear()
         if stop < 1 << 30:
             with pytest.raises(CancelledError):
@@ -198,6 +206,7 @@ def test_filling_a_cache_can_be_stopped_at_any_time():
         else:
             with_cache(room(), EFFORT, show)
             assert calls == sorted(calls)
+            assert len(calls) > 12
             assert calls[-1] == pytest.approx(1)
 
 
@@ -207,6 +216,13 @@ WORLD = build_scenes.snapshot(BLOCKS, build_scenes.lamps(LAMP), (0.7, 0.8, 1.0))
 QUICK = Settings(samples=64, bounces=16, error=0.3, method="cache")
 
 
+@pytest.fixture
+def always(monkeypatch):
+    """Caches also in small bakes."""
+    monkeypatch.setattr(job, "WORTH", 0)
+
+
+@pytest.mark.usefixtures("always")
 def test_a_bake_by_the_cache_sees_what_paths_see(tmp_path):
     job.bake(WORLD, tmp_path, QUICK)
     rng = np.random.default_rng(3)
@@ -218,6 +234,7 @@ def test_a_bake_by_the_cache_sees_what_paths_see(tmp_path):
     assert np.sqrt(((found - truth) ** 2).mean()) < 0.1 * truth.mean()
 
 
+@pytest.mark.usefixtures("always")
 def test_cells_baked_one_by_one_by_the_cache_are_those_baked_together(tmp_path):
     whole = job.bake(WORLD, tmp_path / "whole", QUICK, threads=1)
     cells = [(i, j) for i in (-1, 0) for j in (-1, 0)]
@@ -225,6 +242,47 @@ def test_cells_baked_one_by_one_by_the_cache_are_those_baked_together(tmp_path):
     for cell in reversed(cells):
         job.bake(WORLD, tmp_path / "parts", QUICK, [cell], threads=2)
     assert cells_only(tmp_path / "parts") == cells_only(tmp_path / "whole")
+
+
+@pytest.mark.usefixtures("always")
+@pytest.mark.parametrize("thickness", [0.3, 0.02])
+def test_a_bake_by_the_cache_keeps_a_sealed_room_dark(thickness, tmp_path):
+    case = leak_scenes.two_rooms(thickness)
+    job.bake(case.scene, tmp_path, Settings(samples=32, bounces=8, error=0.2, method="cache"))
+    baked = world.load(tmp_path)
+    assert baked.irradiance(*leak_scenes.sample(case.dark, 3000, 1)).max() == 0
+    assert baked.irradiance(*leak_scenes.sample(case.lit, 300, 2)).min() > 0
+
+
+@pytest.mark.usefixtures("always")
+def test_a_cell_of_a_large_scene_does_not_depend_on_the_others(tmp_path):
+    """Larger than a cell, so that each cell has a cache of its own."""
+    large = build_scenes.snapshot([(build_scenes.plane(90.0), matte(0.6)), *BLOCKS[1:]], WORLD.lights, (0.7, 0.8, 1.0))
+    settings = dataclasses.replace(QUICK, samples=8, finest=2.0)
+    job.bake(large, tmp_path / "both", settings, [(-1, 0), (0, 0)], threads=2)
+    job.bake(large, tmp_path / "one", settings, [(0, 0)], threads=1)
+    one, both = cells_only(tmp_path / "one"), cells_only(tmp_path / "both")
+    assert one
+    assert one == {name: both[name] for name in one}
+
+
+def test_lamps_that_light_a_spot_within_a_surfel_are_not_missed():
+    walls = build_scenes.box((0, 0, 0), (3, 3, 2.5), inward=True)
+    place = {"position": (1.5, 1.5, 2.0), "strength": (4, 4, 4), "size": (0.001, 0)}
+    lamp = place | {"kind": LightKind.SPOT, "spot": (float(np.cos(0.015)), 0.1)}
+    scene = prepare(build_scenes.snapshot([(walls, matte(0.7))], build_scenes.lamps(lamp)), Model())
+    position = np.ascontiguousarray(np.random.default_rng(5).uniform(0.1, 2.4, (150, 3)).T.astype(np.float32))
+    paths = np.mean([measured(scene, position, seed) for seed in range(8)])
+    for seed in range(3):
+        cached = with_cache(scene, dataclasses.replace(EFFORT, seed=seed))
+        assert measured(cached, position, seed + 50).mean() == pytest.approx(paths, rel=0.1)
+
+
+def test_cells_that_take_few_paths_have_no_cache(tmp_path, monkeypatch):
+    monkeypatch.setattr(radiosity, "around", None)
+    job.bake(WORLD, tmp_path, dataclasses.replace(QUICK, samples=2), [(0, 0)])
+    with pytest.raises(TypeError):
+        job.bake(WORLD, tmp_path, dataclasses.replace(QUICK, samples=1 << 16), [(0, 0)])
 
 
 def test_another_method_is_another_bake(tmp_path):

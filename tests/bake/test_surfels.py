@@ -82,7 +82,7 @@ def test_paths_end_by_how_far_they_came_and_go_on_where_nothing_is_known():
     none = np.zeros(1, bool)
     known = Known(LATTICE, table, position[:, :1] + 0.1, none, none, floor)
     cache = Surfels(known, light, light / 2)
-    beta, reflectance = np.full((3, 4), 0.5, np.float32), np.full((3, 4), 0.25, np.float32)
+    beta, reflectance = np.full((3, 4), 0.5, np.float32), np.tile(columns((0.25, 0.5, 0.75)), 4)
     lane = np.array([3, 0, 2, 1])
     wave = Wave(lane, position, normal, beta, np.ones(4, np.float32))
     found = Radiance(*(np.zeros(shape, np.float32) for shape in ((3, 4), (1, 3, 4), (2, 3, 4))))
@@ -90,7 +90,7 @@ def test_paths_end_by_how_far_they_came_and_go_on_where_nothing_is_known():
     left, on = cache.finish(wave, Vertex(np.zeros(4, np.int32), position, normal, reflectance), travelled, found)
     assert left.tolist() == [1, 2, 3]
     assert left[on].tolist() == [2, 3]
-    whole = light[0] * 0.125 / np.pi
+    whole = light[0] * [0.125, 0.25, 0.375] / np.pi
     assert pytest.approx(np.array([whole[0], whole[0] / 2, 0 * whole[0], 0 * whole[0]])) == found.local[:, lane].T
     assert found.sun[0][:, 3] == pytest.approx(whole[1])
     assert found.sky[:, :, 3] == pytest.approx(whole[2:])
