@@ -1,8 +1,8 @@
 """The path tracer: wavefronts of paths that carry all three transports at once.
 
 Comes in: rays and their random numbers. Goes out: for each ray the radiance that comes back along it, apart for
-local light, for every sun key and for every function of the sky. Unbiased but for the bounce limit, and the surface cache
-where the scene has one.
+local light, for every sun key and for every function of the sky. Unbiased but for the bounce limit, and for the surface
+cache where the scene has one.
 """
 
 from __future__ import annotations
