@@ -138,6 +138,21 @@ def test_spots_that_lamps_light_from_close_by_are_counted_once():
     assert abs(np.mean(cache) - np.mean(paths)) < BIAS * np.mean(paths) + STANDARD_ERRORS * noise
 
 
+def test_a_dim_room_beside_bright_ground_gets_all_its_bounces(monkeypatch):
+    box = build_scenes.box((0, 0, 0.05), (3, 3, 2.5), inward=True)
+    wall = (box[:, :, 0] == 0).all(axis=1)
+    sides = [((0, y, 0.05), (0, y, 2.5), (0, z, 2.5), (0, z, 0.05)) for y, z in ((0, 1.35), (1.65, 3))]
+    closed = np.concatenate([box[~wall], *(build_scenes.quad(*side) for side in sides)])
+    parts = [(build_scenes.plane(12.0), matte(0.5)), (closed, matte(0.85))]
+    scene = prepare(build_scenes.snapshot(parts, sky=(1, 1, 1)), Model(local=False, sky="fixed"))
+    inside = np.random.default_rng(5).uniform(0.2, 2.3, (100, 3)).T
+    position, found = np.ascontiguousarray(inside.astype(np.float32)), []
+    for left in (radiosity.LEFT, 0):
+        monkeypatch.setattr(radiosity, "LEFT", left)
+        found.append(measured(with_cache(scene, dataclasses.replace(EFFORT, bounces=64)), position, 1).mean())
+    assert found[0] == pytest.approx(found[1], rel=1e-3)
+
+
 def test_the_cache_is_less_noisy_than_paths():
     scene, position = room(), free_points(100)
     cached = with_cache(scene)
@@ -148,8 +163,10 @@ def test_the_cache_is_less_noisy_than_paths():
     assert (spread[1] < spread[0]).all()
 
 
+@pytest.mark.parametrize("finders", [(16, 16), discovery.EACH])
 @pytest.mark.parametrize("thickness", [0.3, 0.02, 0.0])
-def test_no_light_comes_through_a_wall_that_cuts_through_cubes(thickness):
+def test_no_light_comes_through_a_wall_that_cuts_through_cubes(thickness, finders, monkeypatch):
+    monkeypatch.setattr(discovery, "EACH", finders)
     case = leak_scenes.two_rooms(thickness, leak_scenes.Pose(0.065, 17.0))
     scene = with_cache(prepare(case.scene, Model()))
     points, normals = leak_scenes.sample(case.dark, 400, 1)
