@@ -22,9 +22,6 @@ BAR = 1e-3
 OBLIQUE = 4
 """Times the bar that single points may reach where walls cut through voxels at an angle."""
 
-SHEET = 10
-"""The same for walls without thickness, half a millimetre beside which data points of the other room may stand."""
-
 POINTS = 3000
 
 
@@ -61,11 +58,14 @@ def test_no_light_falls_through_a_floor(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("thickness", [0.3, 0.1, 0.02, 0.0])
 @pytest.mark.parametrize(("shift", "turn"), [(0.0, 0.0), (0.065, 0.0), (0.155, 17.0), (0.25, 45.0)])
-def test_a_wall_of_any_thickness_keeps_a_sealed_room_dark_wherever_it_stands(thickness, shift, turn, tmp_path):
+def test_a_wall_of_any_thickness_keeps_a_sealed_room_dark_wherever_it_stands(thickness, shift, turn, tmp_path, request):
+    if (thickness, turn) == (0.0, 45.0):
+        reason = "one point of 3,000, half a millimetre beside a sheet, gets 0.6 % of the light"
+        request.applymarker(pytest.mark.xfail(strict=True, reason=reason))
     found = leak(leak_scenes.two_rooms(thickness, Pose(shift, turn)), tmp_path)
     assert found.mean() < BAR / 10
     assert np.quantile(found, 0.99) < BAR
-    assert found.max() < (OBLIQUE if thickness else SHEET) * BAR
+    assert found.max() < OBLIQUE * BAR
 
 
 @pytest.mark.slow
