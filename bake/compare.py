@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ..tree import world
-from . import reference, snapshot_file, warp
+from . import reference, snapshot_file
 from .gather import Effort
 from .lamps import LUMINANCE
 from .picture import check_path, write_pictures
@@ -116,9 +116,7 @@ def surface_points(scene: Scene, camera: Camera, size: tuple[int, int]):
         origin[:, rows] = reached + direction[:, rows] * scene.tracer.offset(reached, hits.distance[rows])
         hits = scene.tracer.intersect(origin, direction)
     pixels = np.flatnonzero(hits.triangle != MISS)
-    normal = hits.normal[:, pixels]
-    normal = normal / np.maximum(np.sqrt(warp.dot(normal, normal)), np.float32(1e-30))
-    normal = normal * -np.copysign(np.float32(1), warp.dot(normal, direction[:, pixels]))
+    normal = hits.facing(direction)[:, pixels]
     points = (origin[:, pixels] + direction[:, pixels] * hits.distance[pixels]).T.astype(np.float64) + scene.origin
     return points, np.ascontiguousarray(normal.T), pixels
 

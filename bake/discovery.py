@@ -14,14 +14,14 @@ from itertools import zip_longest
 import numpy as np
 
 from . import paths
-from .gather import TILE_LANES, Effort, run_tiles
+from .gather import TILE_LANES, Effort, run_tiles, seeded, tiles
 from .paths import Numbers, Radiance, Vertex, Wave
 from .receivers import Receivers, lifted
 from .scene import Scene
-from .sobol import Sampler, scramble
+from .sobol import Sampler
 from .surfels import NONE, Lattice, are_crowded, open_between
 
-__all__ = ["Places", "Spending", "find", "numbers", "tiles", "vertex"]
+__all__ = ["Places", "Spending", "find", "numbers", "vertex"]
 
 FINDERS, EACH = 1 << 20, (16, 256)
 """Paths that look for surfels, and the fewest and most from each receiver."""
@@ -122,22 +122,6 @@ def find(
     return lattice, Places(known, above[:, some], crowded, position[:, chosen], normal[:, chosen])
 
 
-def tiles(count: int, size: int) -> list[np.ndarray]:
-    """Split rows.
-
-    Parameters
-    ----------
-    count, size : int
-        Rows, and most of them in a tile.
-
-    Returns
-    -------
-    list of (m,) int64 ndarray
-        In their order.
-    """
-    return [np.arange(first, min(first + size, count)) for first in range(0, count, size)]
-
-
 def vertex(position: np.ndarray, normal: np.ndarray) -> Vertex:
     """Take places for vertices of paths.
 
@@ -171,7 +155,7 @@ def numbers(keys: np.ndarray, seed: int, stage: int, count: int) -> Numbers:
     Numbers
         For n * count lanes.
     """
-    keys = scramble(scramble(keys, 0xCAC4E + stage), (seed & 0xFFFFFFFF) + 1)
+    keys = seeded(keys, seed, 0xCAC4E + stage)
     return Numbers(Sampler(keys, 0, count), *np.divmod(np.arange(len(keys) * count), count))
 
 

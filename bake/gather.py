@@ -113,7 +113,7 @@ def gather(
     )
     if not (scene.has_local or suns or functions):
         return out
-    keys = _seeded(keys, effort.seed)
+    keys = seeded(keys, effort.seed)
 
     def work(rows: np.ndarray) -> int:
         tile = _gather_tile(scene, sensor, position[:, rows], rows, keys[rows], effort)
@@ -126,9 +126,24 @@ def gather(
         return len(rows)
 
     size = max(1, TILE_LANES // min(effort.samples, BLOCK_SAMPLES))
-    tiles = [np.arange(first, min(first + size, count)) for first in range(0, count, size)]
-    run_tiles(work, tiles, effort.threads, progress)
+    run_tiles(work, tiles(count, size), effort.threads, progress)
     return out
+
+
+def tiles(count: int, size: int) -> list[np.ndarray]:
+    """Split rows for `run_tiles`.
+
+    Parameters
+    ----------
+    count, size : int
+        Rows, and most of them in a tile.
+
+    Returns
+    -------
+    list of (m,) int64 ndarray
+        In their order.
+    """
+    return [np.arange(first, min(first + size, count)) for first in range(0, count, size)]
 
 
 def run_tiles(
@@ -190,7 +205,7 @@ def _gather_block(scene: Scene, sensor: Sensor, position, rows, sampler: Sampler
     start = np.ascontiguousarray(position[:, point])
     wave = Wave(lanes, start.copy(), direction, np.ones_like(direction), pdf)
     light = paths.trace(scene, wave, numbers, bounces)
-    stacked = np.concatenate([light.local[None], light.sun, light.sky])
+    stacked = light.stacked()
     stacked /= pdf
     weights = sensor.response(rows[point], direction)
     total = _project(weights, stacked.reshape(-1, len(lanes)), len(rows), count)
@@ -262,6 +277,19 @@ def _unit(vector: np.ndarray) -> np.ndarray:
     return vector / np.maximum(np.sqrt(warp.dot(vector, vector)), np.float32(1e-30))
 
 
-def _seeded(keys: np.ndarray, seed: int) -> np.ndarray:
-    """Keys that another seed makes unrelated."""
-    return scramble(scramble(keys, 0), (seed & 0xFFFFFFFF) + 1)
+def seeded(keys: np.ndarray, seed: int, use: int = 0) -> np.ndarray:
+    """Keys that another seed, or another use, makes unrelated.
+
+    Parameters
+    ----------
+    keys : (n,) uint32 ndarray
+        Random keys.
+    seed, use : int
+        What they are for.
+
+    Returns
+    -------
+    (n,) uint32 ndarray
+        A bijection of `keys`.
+    """
+    return scramble(scramble(keys, use), (seed & 0xFFFFFFFF) + 1)

@@ -163,8 +163,7 @@ class LitSpots:
 
     def _arrive(self, start: np.ndarray, direction: np.ndarray, hits: Hits, travelled: np.ndarray):
         """Points off the surfaces that rays meet, and unit normals towards where they come from."""
-        length = np.maximum(np.sqrt(warp.dot(hits.normal, hits.normal)), np.float32(1e-37))
-        normal = hits.normal * (-np.copysign(np.float32(1), warp.dot(hits.normal, direction)) / length)
+        normal = hits.facing(direction)
         way = np.where(hits.triangle == MISS, np.float32(0), travelled)
         spot = start + direction * way
         return spot + normal * self.tracer.offset(spot, way), normal

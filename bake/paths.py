@@ -67,6 +67,16 @@ class Radiance:
         shapes = ((3, lanes), (suns, 3, lanes), (functions, 3, lanes))
         return cls(*(np.zeros(shape, np.float32) for shape in shapes))
 
+    def stacked(self) -> np.ndarray:
+        """Join all functions.
+
+        Returns
+        -------
+        (1 + keys + functions, 3, n) float32 ndarray
+            Local light, suns, sky; a copy.
+        """
+        return np.concatenate([self.local[None], self.sun, self.sky])
+
 
 @dataclass
 class Wave:
@@ -391,9 +401,7 @@ def _add_emission(scene: Scene, wave: Wave, hits: Hits, travelled: np.ndarray, l
 
 def _arrive(scene: Scene, wave: Wave, hits: Hits, travelled: np.ndarray) -> Vertex:
     """Points off the surface on the side that the path came from."""
-    length = np.sqrt(warp.dot(hits.normal, hits.normal))
-    facing = -np.copysign(np.float32(1), warp.dot(hits.normal, wave.direction)) / np.maximum(length, np.float32(1e-37))
-    normal = hits.normal * facing
+    normal = hits.facing(wave.direction)
     position = wave.origin + wave.direction * hits.distance
     position += normal * scene.tracer.offset(position, travelled)
     reflectance = scene.surfaces.reflectance(hits.triangle, hits.u, hits.v)

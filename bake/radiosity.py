@@ -16,9 +16,9 @@ from collections.abc import Callable
 import numpy as np
 
 from ..tree.grid import Grid
-from . import paths, receivers, warp
-from .discovery import Places, Spending, find, numbers, tiles, vertex
-from .gather import TILE_LANES, Effort, run_tiles
+from . import paths, receivers
+from .discovery import Places, Spending, find, numbers, vertex
+from .gather import TILE_LANES, Effort, run_tiles, tiles
 from .lamps import luminance
 from .lit_spots import LitSpots
 from .paths import Numbers, Radiance, Vertex, Wave
@@ -31,7 +31,7 @@ from .surfels import NONE, Known, Lattice, Surfels, Table, reflected
 __all__ = ["around", "cached"]
 
 FOUND = 0.3
-"""Part of the progress that they take."""
+"""Part of the progress that finding surfels takes."""
 
 BLOCK = 1 << 20
 """Numbers that are read at a time."""
@@ -193,9 +193,7 @@ class _Work:
         hits = self.scene.tracer.intersect(start, direction)
         met = np.flatnonzero(hits.triangle != MISS)
         place = start[:, met] + direction[:, met] * hits.distance[met]
-        length = np.sqrt(warp.dot(hits.normal, hits.normal))[met]
-        normal = hits.normal[:, met] * (-np.sign(warp.dot(hits.normal, direction))[met] / length)
-        number = self.known.table.find(self.known.lattice.keys(place, normal)[0])
+        number = self.known.table.find(self.known.lattice.keys(place, hits.facing(direction)[:, met])[0])
         number = np.unique(number[number >= 0])
         return number[self.dark[number]]
 
@@ -233,7 +231,7 @@ class _Work:
 
 def _mean(light: Radiance, count: int) -> np.ndarray:
     """(3, n, functions) mean over `count` lanes for each surfel."""
-    stacked = np.concatenate([light.local[None], light.sun, light.sky])
+    stacked = light.stacked()
     return stacked.reshape(*stacked.shape[:2], -1, count).mean(axis=3).transpose(1, 2, 0)
 
 

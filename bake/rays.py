@@ -61,6 +61,22 @@ class Hits:
         parts = (getattr(self, name)[rows] for name in ("triangle", "distance", "u", "v"))
         return Hits(*parts, self.normal[:, rows])
 
+    def facing(self, direction: np.ndarray) -> np.ndarray:
+        """Normals of the sides that rays came to.
+
+        Parameters
+        ----------
+        direction : (3, n) float32 ndarray
+            Where the rays went.
+
+        Returns
+        -------
+        (3, n) float32 ndarray
+            Unit vectors.
+        """
+        length = np.maximum(np.sqrt(warp.dot(self.normal, self.normal)), np.float32(1e-37))
+        return self.normal * (-np.copysign(np.float32(1), warp.dot(self.normal, direction)) / length)
+
 
 class Tracer:
     """Rays against a fixed set of triangles; safe to call from several threads.

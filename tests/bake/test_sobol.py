@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from gi_volumes.bake import sobol
-from gi_volumes.bake.gather import _seeded
+from gi_volumes.bake.gather import seeded
 from gi_volumes.bake.sobol import DIMENSIONS, Sampler, points, scramble
 from scipy.stats import qmc
 from statistics_checks import SIGNIFICANCE, chi_square, grid_counts
@@ -118,7 +118,7 @@ def test_numbers_of_different_dimensions_keys_and_seeds_are_uncorrelated_and_a_s
     keys = np.arange(count, dtype=np.uint32)
     dimensions = (0, 1, 2, 3, 4, 5, 30, 63, 64, 65, 66, 1000, 65472, 65536, 65537, 65600)
     rows = [every_number(keys, 4, d)[:, 3] for d in dimensions]
-    rows += [every_number(_seeded(keys, seed), 4, d)[:, 3] for seed in (0, 1, -1, 2**31 - 1) for d in (0, 64)]
+    rows += [every_number(seeded(keys, seed), 4, d)[:, 3] for seed in (0, 1, -1, 2**31 - 1) for d in (0, 64)]
     rows += [np.roll(rows[d], 1) for d in (0, 8)]
     correlation = np.corrcoef(rows) - np.eye(len(rows))
     assert np.abs(correlation).max() < bound
@@ -131,8 +131,8 @@ def test_equal_keys_share_their_numbers_and_equal_seeds_their_keys():
     numbers = every_number(keys, 64, 2)
     assert np.array_equal(numbers[0], numbers[2])
     assert not np.array_equal(numbers[0], numbers[1])
-    assert np.array_equal(_seeded(keys, 3), _seeded(keys, 3))
-    assert not (_seeded(keys, 3) == _seeded(keys, 4)).any()
+    assert np.array_equal(seeded(keys, 3), seeded(keys, 3))
+    assert not (seeded(keys, 3) == seeded(keys, 4)).any()
 
 
 def test_scrambling_is_a_bijection_in_which_every_input_bit_moves_every_output_bit():
