@@ -24,8 +24,6 @@ from .arrays import check_output, one_line, read_points, write_array
 from .place import SNAPSHOT_NAME, check_target, scene_defects
 from .progress import Progress
 from .settings import (
-    CACHED_BOUNCES,
-    ERRORS,
     QUALITIES,
     Settings,
     SettingsError,
@@ -235,10 +233,9 @@ def _add_points(command: argparse.ArgumentParser) -> None:
 
 
 def _run_bake(options, extract: Extract, progress: Progress) -> dict:
-    samples, bounces = QUALITIES[options.quality]
-    bounces = CACHED_BOUNCES if options.method == "cache" else bounces
-    settings = _settings(options, options.samples or samples, bounces, options.finest)
-    error = ERRORS[options.quality] if options.error is None else options.error
+    preset = Settings.of(options.quality, options.method)
+    settings = _settings(options, options.samples or preset.samples, preset.bounces, options.finest)
+    error = preset.error if options.error is None else options.error
     own = {"error": error, "fit": not options.no_fit, "dilation": options.dilation, "method": options.method}
     own |= {"max_points": options.max_points, "max_bytes": options.max_bytes}
     settings = dataclasses.replace(settings, **own)

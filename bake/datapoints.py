@@ -14,7 +14,7 @@ import numpy as np
 
 from ..tree.cells import OFFSET_STEPS
 from . import warp
-from .gather import TILE_LANES, run_tiles
+from .parallel import run_tiles, tile_size, tiles
 from .rays import MISS
 from .scene import Scene
 from .sobol import Sampler, scramble
@@ -114,8 +114,7 @@ def place(
         _move_out(scene, center, size, key, rows[inside], ways, offset, valid)
         return len(rows)
 
-    step = TILE_LANES // PROBE_RAYS
-    run_tiles(work, [np.arange(a, min(a + step, len(center))) for a in range(0, len(center), step)], threads, progress)
+    run_tiles(work, tiles(len(center), tile_size() // PROBE_RAYS), threads, progress)
     position = np.ascontiguousarray(_moved(center, offset, size).T.astype(np.float32))
     return Placement(position, offset, valid)
 

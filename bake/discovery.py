@@ -14,7 +14,8 @@ from itertools import zip_longest
 import numpy as np
 
 from . import paths
-from .gather import TILE_LANES, Effort, run_tiles, seeded, tiles
+from .gather import Effort, seeded
+from .parallel import run_tiles, tile_size, tiles
 from .paths import Numbers, Radiance, Vertex, Wave
 from .receivers import Receivers, lifted
 from .scene import Scene
@@ -180,7 +181,7 @@ def _met(scene: Scene, at: Receivers, effort: Effort, show: Callable[[float], bo
     finders = int(np.clip(FINDERS // max(len(at.key), 1), *EACH))
     at = at.take(np.arange(0, len(at.key), max(1, len(at.key) * finders // FINDERS)))
     start, normal = lifted(scene, at), np.ascontiguousarray(at.normal.T)
-    dark, size = _in_the_dark(scene), TILE_LANES // finders
+    dark, size = _in_the_dark(scene), tile_size() // finders
     parts = tiles(len(at.key), size)
     found = [_Finder() for _ in parts]
 
@@ -216,5 +217,5 @@ def _see(scene: Scene, position: np.ndarray, target: np.ndarray, threads: int) -
         seen[rows] = open_between(scene.tracer, position[:, rows], target[:, rows])
         return len(rows)
 
-    run_tiles(look, tiles(len(seen), TILE_LANES), threads)
+    run_tiles(look, tiles(len(seen), tile_size()), threads)
     return seen

@@ -7,22 +7,18 @@ summed in the same order and blocks, so results do not depend on tiles or thread
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 
 import numpy as np
 
 from . import lit_spots, paths, warp
+from .parallel import run_tiles, tile_size, tiles
 from .paths import Numbers, Wave
 from .scene import Scene
 from .sensors import Sensor
 from .sobol import Sampler, scramble
 from .visibility import FAR, TARGET_SHORTENED, unblocked
-
-TILE_LANES = 65536
-"""Paths in flight per thread: below, numpy's cost per call shows; above, they fall out of the cache."""
 
 BLOCK_SAMPLES = 1024
 """Most samples of a point in one wavefront; part of the result's definition, as it orders the sums."""
@@ -62,10 +58,6 @@ class Gathered:
     local: np.ndarray
     sun: np.ndarray
     sky: np.ndarray
-
-
-class CancelledError(Exception):
-    """The caller asked to stop; nothing of the unfinished points is kept."""
 
 
 def gather(
@@ -125,63 +117,9 @@ def gather(
             out.sky[rows] = tile[:, 1 + suns :]
         return len(rows)
 
-    size = max(1, TILE_LANES // min(effort.samples, BLOCK_SAMPLES))
+    size = max(1, tile_size(1 + suns + functions) // min(effort.samples, BLOCK_SAMPLES))
     run_tiles(work, tiles(count, size), effort.threads, progress)
     return out
-
-
-def tiles(count: int, size: int) -> list[np.ndarray]:
-    """Split rows for `run_tiles`.
-
-    Parameters
-    ----------
-    count, size : int
-        Rows, and most of them in a tile.
-
-    Returns
-    -------
-    list of (m,) int64 ndarray
-        In their order.
-    """
-    return [np.arange(first, min(first + size, count)) for first in range(0, count, size)]
-
-
-def run_tiles(
-    work: Callable[[np.ndarray], int],
-    tiles: list[np.ndarray],
-    threads: int,
-    progress: Callable[[int], bool] | None = None,
-) -> None:
-    """Run independent tiles on threads; embreex and numpy release Python's lock.
-
-    Parameters
-    ----------
-    work : callable
-        Does one tile and returns how many points it held.
-    tiles : list of ndarray
-        The tiles, first come first served.
-    threads : int
-        How many at once; 0 uses every core.
-    progress : callable, optional
-        Called with the points done so far; returns False to stop.
-
-    Raises
-    ------
-    CancelledError
-        `progress` returned False; tiles that run are finished, the others never start.
-    """
-    done = 0
-    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
-        pending: set[Future] = {pool.submit(work, tile) for tile in tiles}
-        try:
-            while pending:
-                finished, pending = wait(pending, return_when=FIRST_COMPLETED)
-                done += sum(future.result() for future in finished)
-                if progress is not None and not progress(done):
-                    raise CancelledError
-        except BaseException:
-            pool.shutdown(wait=True, cancel_futures=True)
-            raise
 
 
 def _gather_tile(scene: Scene, sensor: Sensor, position, rows, keys, effort: Effort) -> np.ndarray:

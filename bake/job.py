@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,8 +24,9 @@ from ..tree.planes import of_cell
 from ..tree.topology import Topology
 from . import radiosity, snapshot_file
 from .fills import fills
-from .gather import CancelledError, Effort
+from .gather import Effort
 from .measured import split
+from .parallel import CancelledError, Room, run_jobs
 from .place import Place, check_target
 from .progress import Progress
 from .reference import sun_strength
@@ -51,6 +53,10 @@ CACHED = 0.1
 
 WORTH = 1 << 20
 """Paths that a cell is expected to take, below which they are followed to their end: finding surfels takes as many."""
+
+TOGETHER = 1 << 18
+"""Voxels that geometry lists in cells that are baked at once, most: those of one large cell, so that memory is bounded.
+"""
 
 STEPS = 1000
 """Units of progress in a cell."""
@@ -128,7 +134,8 @@ def bake(
     place = Place(target, snapshot, header)
     effort = Effort(settings.samples, settings.bounces, settings.seed, threads)
     goal = Target(settings.error, settings.max_points, settings.dilation, effort, settings.receiver_samples)
-    work = _Work(scene, grid, place, settings, _judge(snapshot, settings, scene), goal)
+    room = Room(TOGETHER)
+    work = _Work(scene, grid, place, settings, _judge(snapshot, settings, scene), goal, room)
     try:
         trees = _bake_cells(work, wanted, progress)
         place.take()
@@ -140,7 +147,7 @@ def bake(
         outcome.warnings.append(
             f"first-level voxels of {grid.first_size:g} m suit this scene's size; --finest changes it"
         )
-    outcome.warnings += work.warnings
+    outcome.warnings += sorted(work.warnings)
     if len(listed) < len(occupied):
         outcome.warnings.append(f"{len(occupied) - len(listed)} of the scene's {len(occupied)} cells are not baked yet")
     outcome.seconds = progress.seconds
@@ -189,8 +196,10 @@ class _Work:
     settings: Settings
     judge: Judge
     target: Target
+    room: Room
     warnings: list[str] = field(default_factory=list)
     shared: list[Scene] = field(default_factory=list)
+    lock: threading.Lock = field(default_factory=threading.Lock)
 
     def light_in(self, cell: Outline, show: Callable[[float], bool]) -> Scene:
         """The scene, with a surface cache if there is to be one, and it is worth the paths that it takes: of a scene no
@@ -198,18 +207,16 @@ class _Work:
         expected = self.settings.samples * sum(len(coords) for coords in cell.coords)
         if self.settings.method != "cache" or expected < WORTH:
             return self.scene
-        if self.shared:
+        bounds, effort = self.scene.soup.bounds, self.target.effort
+        if np.ptp(bounds[:, :2], axis=0).max() > self.grid.cell_size:
+            dense = np.stack([cell.dense.low, cell.dense.low + cell.dense.shape]) * self.grid.first_size
+            return radiosity.around(self.scene, self.grid, dense, effort, lambda share: show(CACHED * share))
+        with self.lock:
+            if not self.shared:
+                box = np.stack([bounds[0], np.nextafter(bounds[1], np.inf)])
+                found = radiosity.around(self.scene, self.grid, box, effort, lambda share: show(CACHED * share))
+                self.shared.append(found)
             return self.shared[0]
-        bounds, small = (
-            self.scene.soup.bounds,
-            np.ptp(self.scene.soup.bounds[:, :2], axis=0).max() <= self.grid.cell_size,
-        )
-        dense = np.stack([cell.dense.low, cell.dense.low + cell.dense.shape]) * self.grid.first_size
-        box = np.stack([bounds[0], np.nextafter(bounds[1], np.inf)]) if small else dense
-        scene = radiosity.around(self.scene, self.grid, box, self.target.effort, lambda share: show(CACHED * share))
-        if small:
-            self.shared.append(scene)
-        return scene
 
 
 def _judge(snapshot: Snapshot, settings: Settings, scene: Scene) -> Judge:
@@ -242,18 +249,24 @@ class _Counts:
 
 
 def _bake_cells(work: _Work, cells: list[tuple[int, int]], progress: Progress) -> list[_Counts]:
-    """Cell after cell, of which nothing stays in memory; the ones already there are only read."""
+    """All cells, some of them at once, of which nothing stays in memory; the ones already there are only read."""
     progress.stage("Baking", STEPS * len(cells))
-    counts = []
-    for number, cell in enumerate(cells):
-        done = STEPS * number
-        if folder.has_cell(work.place.target, cell, work.place.identity):
-            tree = folder.read_cell(work.place.target, cell).topology
+    done, lock = [0] * len(cells), threading.Lock()
+
+    def show(number: int, share: float) -> bool:
+        with lock:
+            done[number] = int(share * STEPS)
+            return progress.show(sum(done))
+
+    def bake_one(number: int) -> _Counts:
+        if folder.has_cell(work.place.target, cells[number], work.place.identity):
+            tree = folder.read_cell(work.place.target, cells[number]).topology
         else:
-            tree = _bake_cell(work, cell, lambda share, d=done: progress.show(d + int(share * STEPS)))
-        counts.append(_Counts.of(tree))
-        progress.show(done + STEPS)
-    return counts
+            tree = _bake_cell(work, cells[number], lambda share: show(number, share))
+        show(number, 1.0)
+        return _Counts.of(tree)
+
+    return run_jobs(bake_one, len(cells), work.target.effort.threads)
 
 
 def _bake_cell(work: _Work, cell: tuple[int, int], show: Callable[[float], bool]) -> Topology:
@@ -261,6 +274,12 @@ def _bake_cell(work: _Work, cell: tuple[int, int], show: Callable[[float], bool]
     takes more bytes than it may."""
     found = outline(work.scene.soup.corners, work.grid, cell, by_light=work.target.error > 0)
     _check_cap(found, work.target.max_points)
+    with work.room.hold(sum(len(coords) for coords in found.coords)):
+        return _fill_cell(work, cell, found, show)
+
+
+def _fill_cell(work: _Work, cell: tuple[int, int], found: Outline, show: Callable[[float], bool]) -> Topology:
+    """The same for a cell whose outline is known."""
     scene, target, limit = work.light_in(found, show), work.target, work.settings.max_bytes
     if scene is not work.scene:
         whole, show = show, lambda share: whole(CACHED + (1 - CACHED) * share)

@@ -16,8 +16,8 @@ import numpy as np
 from ..tree import interpolate
 from ..tree.blend import ENOUGH
 from . import blockers
-from .gather import run_tiles
 from .halfspaces import SLOTS, Falloff, Trial, heights, ranges
+from .parallel import run_tiles
 from .receivers import Receivers
 from .scene import Scene
 from .sight import Pairs, look
@@ -88,7 +88,7 @@ def fit(
     threads : int
         Worker threads; 0 uses every core.
     progress : callable, optional
-        As in `gather.run_tiles`, counting receivers whose rays are traced.
+        As in `parallel.run_tiles`, counting receivers whose rays are traced.
 
     Returns
     -------

@@ -10,6 +10,7 @@ import contextlib
 import json
 import shutil
 import tempfile
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -113,6 +114,7 @@ class Place:
         self.target, self.identity, self.taken = target, header["bake"], False
         self._snapshot, self._header = snapshot, header
         self._staging: list[Path] = []
+        self._lock = threading.Lock()
         is_new = not target.exists()
         target.mkdir(parents=True, exist_ok=True)
         try:
@@ -169,7 +171,8 @@ class Place:
         planes: CellPlanes | None = None,
         limit: int = 0,
     ) -> int:
-        """Put all files of a cell into the folder, or none; the tree, which makes a cell count, comes last.
+        """Put all files of a cell into the folder, or none; the tree, which makes a cell count, comes last. Several
+        threads may write cells at once.
 
         Parameters
         ----------
@@ -201,9 +204,10 @@ class Place:
             size = sum(path.stat().st_size for path in staging.iterdir())
             if limit and size > limit:
                 return size
-            self.take()
-            for path in sorted(staging.iterdir(), key=lambda path: path.suffix == ".tree"):
-                path.replace(self.target / path.name)
+            with self._lock:
+                self.take()
+                for path in sorted(staging.iterdir(), key=lambda path: path.suffix == ".tree"):
+                    path.replace(self.target / path.name)
         return size
 
     @contextlib.contextmanager

@@ -18,9 +18,10 @@ import numpy as np
 from ..tree.grid import Grid
 from . import paths, receivers
 from .discovery import Places, Spending, find, numbers, vertex
-from .gather import TILE_LANES, Effort, run_tiles, tiles
+from .gather import Effort
 from .lamps import luminance
 from .lit_spots import LitSpots
+from .parallel import run_tiles, tile_size, tiles
 from .paths import Numbers, Radiance, Vertex, Wave
 from .rays import MISS
 from .receivers import Receivers
@@ -176,7 +177,7 @@ class _Work:
         """Trace in tiles: direct light everywhere, then rays, for which it matters where that is uneven."""
         count = len(self.places.key)
         for stage, (work, lanes) in enumerate(((self.light, self.spending.places), (self.send, self.spending.rays))):
-            parts = tiles(count, max(1, TILE_LANES // lanes))
+            parts = tiles(count, max(1, tile_size(self.direct.shape[2]) // lanes))
             run_tiles(work, parts, self.effort.threads, lambda done, stage=stage: show((stage + done / count) / 2))
             self.uneven[self.lit_unseen() if stage == 0 else []] = True
             self.known = dataclasses.replace(self.known, uneven=self.uneven)

@@ -21,7 +21,7 @@ from ..tree.dualcells import CORNERS
 from ..tree.grid import Grid
 from ..tree.lookup import Atlas
 from ..tree.outline import Outline
-from ..tree.region import Region, finder
+from ..tree.region import finder
 from ..tree.topology import Topology
 from . import judges, occluders, receivers
 from .datapoints import FARTHEST_STEP
@@ -189,9 +189,8 @@ class _Refinement:
         """What subdivision of each solid voxel of a level buys for each data point; 0 where it is good enough."""
         coords, at = self.outline.coords[level], self.state.seen.at
         voxel = np.floor(at.position / float(self.grid.voxel_size(level))).astype(np.int64)
-        near = np.flatnonzero(Region.around(coords).contains(voxel))
-        row = finder(coords)(voxel[near])
-        inside, row = near[row >= 0], row[row >= 0]
+        row = finder(coords)(voxel)
+        inside, row = np.flatnonzero(row >= 0), row[row >= 0]
         area, count = at.area[inside], len(coords)
         squared, noise = (np.bincount(row, values[inside] * area, count) for values in self.errors())
         number = np.maximum(np.bincount(row, minlength=count), 1)

@@ -79,6 +79,26 @@ class Settings:
     fit: bool = True
     method: str = "paths"
 
+    @classmethod
+    def of(cls, quality: str, method: str = "cache") -> Settings:
+        """Choose what a quality stands for.
+
+        Parameters
+        ----------
+        quality : str
+            One of `QUALITIES`.
+        method : str
+            As above.
+
+        Returns
+        -------
+        Settings
+            The rest as it is.
+        """
+        samples, bounces = QUALITIES[quality]
+        bounces = CACHED_BOUNCES if method == "cache" else bounces
+        return cls(samples, bounces, error=ERRORS[quality], method=method)
+
     @property
     def receiver_samples(self) -> int:
         """Paths per receiver: an even number, as errors are measured by two independent halves."""

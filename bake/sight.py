@@ -14,7 +14,7 @@ import numpy as np
 
 from ..tree import interpolate
 from ..tree.blend import ENOUGH
-from .gather import TILE_LANES, run_tiles
+from .parallel import run_tiles, tile_size, tiles
 from .rays import MISS
 from .receivers import Receivers, lifted
 from .scene import Scene
@@ -90,7 +90,7 @@ def look(
     threads : int
         Worker threads; 0 uses every core.
     progress : callable, optional
-        As in `gather.run_tiles`, counting receivers.
+        As in `parallel.run_tiles`, counting receivers.
 
     Returns
     -------
@@ -108,8 +108,7 @@ def look(
         found[int(rows[0])] = _join([*_levels(scene, data, receivers.take(rows), rows)])
         return len(rows)
 
-    count, step = len(receivers.key), TILE_LANES // TAPS
-    run_tiles(work, [np.arange(a, min(a + step, count)) for a in range(0, count, step)], threads, progress)
+    run_tiles(work, tiles(len(receivers.key), tile_size() // TAPS), threads, progress)
     return _sorted([found.pop(first) for first in sorted(found)])
 
 

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from gi_volumes.bake import job, snapshot_file
 from gi_volumes.bake.scene import prepare
-from gi_volumes.bake.settings import ERRORS, QUALITIES, Settings, model
+from gi_volumes.bake.settings import QUALITIES, Settings, model
 from gi_volumes.bake.snapshot import Channel, LightKind, Material, Snapshot
 from gi_volumes.benchmarks.results import add_row
 from gi_volumes.tests.build_scenes import BOX_FACES, lamps, quad, snapshot, sun_frame
@@ -121,8 +121,7 @@ def measure(path: Path, cells: list[tuple[int, int]] | None, quality: str) -> di
     dict of str to float
         Seconds, data points, and the process's memory [GB], with the part that is there before the first cell.
     """
-    samples, bounces = QUALITIES[quality]
-    settings = Settings(samples, bounces, error=ERRORS[quality])
+    settings = Settings.of(quality)
     scene = snapshot_file.load(path)
     held = {"loaded [GB]": _peak()}
     prepare(*model(scene, settings))

@@ -1,6 +1,6 @@
 """Light that leaks to where none can arrive, in scenes made for it.
 
-    python benchmarks/leaks.py [NAME...] [--quality preview] [--finest SIZE] [--record]
+    python benchmarks/leaks.py [NAME...] [--quality preview] [--finest SIZE] [--method cache] [--record]
 
 Figures are in per cent of the lit side's mean irradiance. Where some light does arrive, only what is above the
 path-traced reference counts.
@@ -9,13 +9,14 @@ path-traced reference counts.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
 from gi_volumes.bake import job, reference
-from gi_volumes.bake.settings import ERRORS, QUALITIES, Settings
+from gi_volumes.bake.settings import QUALITIES, Settings
 from gi_volumes.benchmarks.leak_scenes import Case, cases, sample
 from gi_volumes.benchmarks.results import add_row
 from gi_volumes.tree import world
@@ -67,14 +68,14 @@ def main() -> None:
     parser.add_argument("names", nargs="*", help=f"of {', '.join(cases())}; all when left out")
     parser.add_argument("--quality", default="preview", choices=QUALITIES)
     parser.add_argument("--finest", type=float, default=0.0)
+    parser.add_argument("--method", default="cache", choices=("cache", "paths"))
     parser.add_argument("--record", action="store_true")
     options = parser.parse_args()
-    samples, bounces = QUALITIES[options.quality]
-    settings = Settings(samples, bounces, finest=options.finest, error=ERRORS[options.quality])
+    settings = dataclasses.replace(Settings.of(options.quality, options.method), finest=options.finest)
     for name in options.names or cases():
         figures = measure(cases()[name](), settings)
         if options.record:
-            add_row("leaks", f"{name}, {options.quality}, finest {options.finest:g}", figures)
+            add_row("leaks", f"{name}, {options.quality}, finest {options.finest:g}, {options.method}", figures)
         else:
             print(f"{name:32s}", "  ".join(f"{key} {value:.5g}" for key, value in figures.items()), flush=True)
 

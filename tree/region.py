@@ -114,22 +114,20 @@ class Region:
         return self.coords(np.unique(self.keys(coords)))
 
 
-def finder(coords: np.ndarray, margin: int = 1) -> Callable[[np.ndarray], np.ndarray]:
+def finder(coords: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function from voxels to rows.
 
     Parameters
     ----------
     coords : (m, 3) int64
         Voxels, each once.
-    margin : int
-        How far outside the box around them the function may be asked.
 
     Returns
     -------
     callable
         (n, 3) int64 voxels to (n,) int64 rows of `coords`, -1 where there is none.
     """
-    region = Region.around(coords, margin)
+    region = Region.around(coords)
     keys = region.keys(coords)
     order = np.argsort(keys, kind="stable")
     keys = keys[order]
@@ -137,7 +135,7 @@ def finder(coords: np.ndarray, margin: int = 1) -> Callable[[np.ndarray], np.nda
     def find(asked: np.ndarray) -> np.ndarray:
         if not len(keys):
             return np.full(len(asked), -1)
-        wanted = region.keys(asked)
+        wanted = np.where(region.contains(asked), region.keys(asked), -1)
         place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
         return np.where(keys[place] == wanted, order[place], -1)
 

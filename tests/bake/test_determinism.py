@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from command_line import cells_only
 from gi_volumes.bake import gather as gathering
-from gi_volumes.bake import job
-from gi_volumes.bake.gather import CancelledError, Effort, gather
+from gi_volumes.bake import job, parallel
+from gi_volumes.bake.gather import Effort, gather
+from gi_volumes.bake.parallel import CancelledError
 from gi_volumes.bake.scene import Model, Scene, SunDirections, prepare
 from gi_volumes.bake.sensors import HarmonicsSensor, SurfaceSensor
 from gi_volumes.bake.settings import Settings
@@ -88,7 +89,7 @@ CASES = list(itertools.product(("fixed", "harmonics"), ("data points", "surface 
 
 @pytest.mark.parametrize(("sky", "sensor"), CASES)
 def test_the_number_of_threads_changes_no_bit(sky, sensor, scenes, monkeypatch):
-    monkeypatch.setattr(gathering, "TILE_LANES", 640)
+    monkeypatch.setattr(parallel, "LANES", 640)
     position, key, made = points(sensor)
     found = [gather(scenes[sky], made, position, key, Effort(80, 4, 5, threads)) for threads in (1, 2, 3)]
     assert equal(found[0], found[1])
@@ -102,7 +103,7 @@ def test_the_size_of_tiles_changes_no_bit(sky, sensor, scenes, monkeypatch):
     position, key, made = points(sensor)
     whole = gather(scenes[sky], made, position, key, Effort(61, 4, 5, 1))
     for lanes in (1, 183, 500, 1000, 2700):
-        monkeypatch.setattr(gathering, "TILE_LANES", lanes)
+        monkeypatch.setattr(parallel, "LANES", lanes)
         assert equal(whole, gather(scenes[sky], made, position, key, Effort(61, 4, 5, 1))), lanes
 
 
@@ -154,7 +155,7 @@ def test_other_seeds_and_other_keys_give_other_noise_about_the_same_mean_and_a_s
 
 
 def test_progress_counts_every_point_once_and_saying_no_stops_the_work(scenes, monkeypatch):
-    monkeypatch.setattr(gathering, "TILE_LANES", 320)
+    monkeypatch.setattr(parallel, "LANES", 320)
     position, key, made = points("data points")
     counts = []
 

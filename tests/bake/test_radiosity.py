@@ -8,8 +8,9 @@ import build_scenes
 import numpy as np
 import pytest
 from command_line import cells_only
-from gi_volumes.bake import discovery, job, radiosity, reference
-from gi_volumes.bake.gather import CancelledError, Effort, gather
+from gi_volumes.bake import discovery, job, parallel, radiosity, reference
+from gi_volumes.bake.gather import Effort, gather
+from gi_volumes.bake.parallel import CancelledError
 from gi_volumes.bake.scene import Model, Scene, SunDirections, prepare
 from gi_volumes.bake.sensors import HarmonicsSensor
 from gi_volumes.bake.settings import Settings
@@ -178,8 +179,7 @@ def test_no_light_comes_through_a_wall_that_cuts_through_cubes(thickness, finder
 
 def test_the_cache_is_the_same_for_any_number_of_threads_and_any_tiles(monkeypatch):
     one = with_cache(room(), dataclasses.replace(EFFORT, threads=1)).cache
-    for module in (discovery, radiosity):
-        monkeypatch.setattr(module, "TILE_LANES", 1 << 13)
+    monkeypatch.setattr(parallel, "LANES", 1 << 13)
     two = with_cache(room(), dataclasses.replace(EFFORT, threads=3)).cache
     assert len(one.light) > 3 * ((1 << 13) // radiosity.Spending().rays)
     assert one.light.tobytes() == two.light.tobytes()
@@ -207,8 +207,7 @@ def test_a_scene_that_nobody_sees_has_no_surfels_and_its_paths_go_on():
 
 def test_filling_a_cache_can_be_stopped_at_any_time(monkeypatch):
     calls = []
-    for module in (discovery, radiosity):
-        monkeypatch.setattr(module, "TILE_LANES", 1 << 13)
+    monkeypatch.setattr(parallel, "LANES", 1 << 13)
 
     def show(share: float) -> bool:
         calls.append(share)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import build_scenes
 import numpy as np
 import pytest
-from gi_volumes.bake import receivers
-from gi_volumes.bake.gather import CancelledError
+from gi_volumes.bake import parallel
+from gi_volumes.bake.parallel import CancelledError
 from gi_volumes.bake.receivers import Receivers, lifted, spread
 from gi_volumes.bake.scene import Model, Scene, prepare
 from gi_volumes.bake.snapshot import Channel, Material
@@ -111,7 +111,7 @@ def test_receivers_do_not_depend_on_threads_or_on_tiles(monkeypatch):
     scene = scene_of(clutter(5))
     once = everywhere(scene, 0.2, threads=1)
     again = everywhere(scene, 0.2, threads=4)
-    monkeypatch.setattr(receivers, "TILE_LANES", 4096)
+    monkeypatch.setattr(parallel, "LANES", 4096)
     split = everywhere(scene, 0.2, threads=2)
     for other in (again, split):
         for name in ("position", "normal", "area", "key"):

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 from command_line import yard
 from gi_volumes.bake import job
-from gi_volumes.bake.gather import CancelledError, Effort
+from gi_volumes.bake.gather import Effort
+from gi_volumes.bake.parallel import CancelledError
 from gi_volumes.bake.refine import Target, refine
 from gi_volumes.bake.scene import prepare
 from gi_volumes.bake.settings import Settings, choose_grid, model
