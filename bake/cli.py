@@ -332,6 +332,12 @@ def _show_bake(result: dict) -> str:
         f"voxels from {result['voxels']['first']:g} m to {result['voxels']['finest']:g} m",
         f"modelled: {', '.join(result['modelled']) or 'nothing'}",
     ]
+    for item in result["checked"]:
+        bias = f"{100 * item['bias']:+.1f} +- {100 * item['bias_error']:.1f} %"
+        lines.append(
+            f"{item['what']} by the surface cache: {bias} off on average, noise {100 * item['noise']:.1f} % before the "
+            f"fit (beside paths, at {item['places']} places)"
+        )
     lines += [f"left out: {item['what']}: {item['why']}" for item in result["left_out"]]
     lines += [f"warning: {text}" for text in result["warnings"]]
     return "\n".join(lines)

@@ -23,6 +23,7 @@ from ..tree.outline import Outline, outline
 from ..tree.planes import of_cell
 from ..tree.topology import Topology
 from . import radiosity, snapshot_file
+from .check import Check, check
 from .fills import fills
 from .gather import Effort
 from .measured import split
@@ -32,7 +33,17 @@ from .progress import Progress
 from .reference import sun_strength
 from .refine import Target, refine
 from .scene import Model, Scene, prepare, scene_suns
-from .settings import LEVELS, Settings, SettingsError, check_scene, check_triangles, choose_grid, has_free_sun, model
+from .settings import (
+    ERRORS,
+    LEVELS,
+    Settings,
+    SettingsError,
+    check_scene,
+    check_triangles,
+    choose_grid,
+    has_free_sun,
+    model,
+)
 from .snapshot import Snapshot
 from .survey import Judge, State, fitted, shade, shaded
 
@@ -76,6 +87,7 @@ class Outcome:
     voxels: dict[str, float] = field(default_factory=dict)
     modelled: list[str] = field(default_factory=list)
     left_out: list[dict[str, str]] = field(default_factory=list)
+    checked: list[dict] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
 
@@ -147,6 +159,7 @@ def bake(
         outcome.warnings.append(
             f"first-level voxels of {grid.first_size:g} m suit this scene's size; --finest changes it"
         )
+    outcome.checked = _describe_checks(work, list(header["transports"]))
     outcome.warnings += sorted(work.warnings)
     if len(listed) < len(occupied):
         outcome.warnings.append(f"{len(occupied) - len(listed)} of the scene's {len(occupied)} cells are not baked yet")
@@ -199,6 +212,7 @@ class _Work:
     room: Room
     warnings: list[str] = field(default_factory=list)
     shared: list[Scene] = field(default_factory=list)
+    checks: dict[tuple[int, int], Check] = field(default_factory=dict)
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     def light_in(self, cell: Outline, show: Callable[[float], bool]) -> Scene:
@@ -217,6 +231,16 @@ class _Work:
                 found = radiosity.around(self.scene, self.grid, box, effort, lambda share: show(CACHED * share))
                 self.shared.append(found)
             return self.shared[0]
+
+    def trusted(self, cached: Scene, cell: Outline) -> Scene:
+        """The scene with the cache, or without where that is off by more than the bake's error."""
+        if cached is self.scene:
+            return cached
+        made = self.checks[cell.cell] = check(cached, self.scene, cell, self.judge, self.target.effort)
+        if not made.fails(self.settings.error or ERRORS["preview"]):
+            return cached
+        self.warnings.append(f"cell {_list([cell.cell])}: the surface cache is too far off, so paths went to their end")
+        return self.scene
 
 
 def _judge(snapshot: Snapshot, settings: Settings, scene: Scene) -> Judge:
@@ -280,8 +304,8 @@ def _bake_cell(work: _Work, cell: tuple[int, int], show: Callable[[float], bool]
 
 def _fill_cell(work: _Work, cell: tuple[int, int], found: Outline, show: Callable[[float], bool]) -> Topology:
     """The same for a cell whose outline is known."""
-    scene, target, limit = work.light_in(found, show), work.target, work.settings.max_bytes
-    if scene is not work.scene:
+    scene, target, limit = work.trusted(work.light_in(found, show), found), work.target, work.settings.max_bytes
+    if found.cell in work.checks:
         whole, show = show, lambda share: whole(CACHED + (1 - CACHED) * share)
     for attempt in range(BUDGET_TRIES):
         last = attempt == BUDGET_TRIES - 1
@@ -380,6 +404,17 @@ def _describe(snapshot: Snapshot, settings: Settings, light: Model, scene: Scene
         outcome.left_out.append({"what": f"{skipped} voxels", "why": why})
     outcome.left_out += [{"what": note.what, "why": note.why} for note in snapshot.notes]
     return outcome
+
+
+def _describe_checks(work: _Work, transports: list[str]) -> list[dict]:
+    """What the caches of all cells were found to be off by, and the noise of data points, by transport."""
+    made = Check.join([work.checks[cell] for cell in sorted(work.checks)], len(work.judge.views))
+    if len(made.paths) < 2:
+        return []
+    (bias, error), noise = made.bias(), made.noise()
+    parts = {"bias": bias, "bias_error": error, "noise": noise}
+    figures = ({key: round(float(part[number]), 5) for key, part in parts.items()} for number in range(len(bias)))
+    return [{"what": name, "places": len(made.paths)} | row for name, row in zip(transports, figures, strict=True)]
 
 
 def _file_sizes(cells: list[dict]) -> dict[str, int]:
