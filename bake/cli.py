@@ -193,6 +193,8 @@ def _add_bake(commands) -> None:
     text = "full gives surfaces data of the finest voxels alone: two to eight times the data"
     command.add_argument("--dilation", choices=("partial", "full"), default="partial", help=text)
     command.add_argument("--cells", type=_cells, help="only these world cells: 0,1/3,2")
+    text = "write a coarse look at every cell first, within seconds, for those who watch the folder"
+    command.add_argument("--early", action="store_true", help=text)
     _add_light(command)
 
 
@@ -241,7 +243,7 @@ def _run_bake(options, extract: Extract, progress: Progress) -> dict:
     settings = dataclasses.replace(settings, **own)
     check_target(options.output)
     snapshot = _read_scene(options.scene, extract, progress)
-    outcome = job.bake(snapshot, options.output, settings, options.cells, options.threads, progress)
+    outcome = job.bake(snapshot, options.output, settings, options.cells, options.threads, progress, options.early)
     return dataclasses.asdict(outcome)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import itertools
 import json
 import threading
 from collections.abc import Callable
@@ -31,11 +32,12 @@ from .parallel import CancelledError, Room, run_jobs
 from .place import Place, check_target
 from .progress import Progress
 from .reference import sun_strength
-from .refine import Target, refine
+from .refine import Target, refine, sketch
 from .scene import Model, Scene, prepare, scene_suns
 from .settings import (
     ERRORS,
     LEVELS,
+    RECEIVER_SAMPLES,
     Settings,
     SettingsError,
     check_scene,
@@ -65,9 +67,11 @@ CACHED = 0.1
 WORTH = 1 << 20
 """Paths that a cell is expected to take, below which they are followed to their end: finding surfels takes as many."""
 
-TOGETHER = 1 << 18
-"""Voxels that geometry lists in cells that are baked at once, most: those of one large cell, so that memory is bounded.
-"""
+TOGETHER = 3 << 17
+"""Most voxels that geometry lists in cells that are baked at once, as memory is bounded: a large cell and a half."""
+
+EARLY_LEVELS, EARLY_SAMPLES, EARLY_BOUNCES = 2, 64, 6
+"""Levels, paths and bounces of an early look: voxels of 2 m, within seconds."""
 
 STEPS = 1000
 """Units of progress in a cell."""
@@ -98,6 +102,7 @@ def bake(
     cells: list[tuple[int, int]] | None = None,
     threads: int = 0,
     progress: Progress | None = None,
+    early: bool = False,
 ) -> Outcome:
     """Bake some or all cells of a scene.
 
@@ -115,6 +120,9 @@ def bake(
         Worker threads; 0 uses every core.
     progress : Progress, optional
         Where to say how far it is.
+    early : bool
+        Whether to write a coarse look at every cell first, within seconds, for those who watch the folder; not where
+        it would take the place of another bake. What is there in the end is the same.
 
     Returns
     -------
@@ -142,13 +150,15 @@ def bake(
     grid = choose_grid(scene.soup.corners, snapshot.origin, settings.finest, levels)
     occupied = [tuple(int(v) for v in cell) for cell in build.occupied_cells(scene.soup.corners, grid)]
     header = _header(snapshot, settings, light, scene, grid, identity) | {"expected_cells": occupied}
-    wanted = _wanted(cells, occupied)
+    wanted = _in_view(snapshot, grid, _wanted(cells, occupied))
     place = Place(target, snapshot, header)
     effort = Effort(settings.samples, settings.bounces, settings.seed, threads)
     goal = Target(settings.error, settings.max_points, settings.dilation, effort, settings.receiver_samples)
     room = Room(TOGETHER)
     work = _Work(scene, grid, place, settings, _judge(snapshot, settings, scene), goal, room)
     try:
+        if early and place.taken:
+            _look_early(work, wanted, progress)
         trees = _bake_cells(work, wanted, progress)
         place.take()
     finally:
@@ -197,6 +207,15 @@ def _wanted(cells: list[tuple[int, int]] | None, occupied: list[tuple[int, int]]
     if empty:
         raise SettingsError(f"--cells {_list(empty)}: no geometry there; this scene has cells {_list(occupied)}")
     return occupied if cells is None else sorted(set(cells))
+
+
+def _in_view(snapshot: Snapshot, grid: Grid, cells: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Cells in the order in which they are baked: those close to the camera first."""
+    place = np.array(grid.origin[:2]) + grid.cell_size / 2
+    if snapshot.cameras:
+        place = np.array(snapshot.cameras[0].world_from_camera).reshape(3, 4)[:2, 3]
+    middle = np.array(grid.origin[:2]) + (np.array(cells, np.float64).reshape(-1, 2) + 0.5) * grid.cell_size
+    return [cells[row] for row in np.argsort(((middle - place) ** 2).sum(axis=1), kind="stable")]
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,6 +291,27 @@ class _Counts:
         return cls(tree.size, tree.dilated, tree.left_out)
 
 
+def _look_early(work: _Work, cells: list[tuple[int, int]], progress: Progress) -> None:
+    """Write cells of few levels and few paths, where there are none of this bake."""
+    progress.stage("First look", len(cells))
+    grid = dataclasses.replace(work.grid, levels=min(EARLY_LEVELS, work.grid.levels))
+    effort = dataclasses.replace(work.target.effort, samples=EARLY_SAMPLES, bounces=EARLY_BOUNCES)
+    quick = dataclasses.replace(work.target, error=0.0, effort=effort, samples=RECEIVER_SAMPLES)
+    done = itertools.count(1)
+
+    def look(number: int) -> None:
+        if folder.bake_of_cell(work.place.target, cells[number]) != work.place.identity:
+            found = outline(work.scene.soup.corners, grid, cells[number])
+            _check_cap(found, quick.max_points)
+            refined = sketch(work.scene, found, work.judge, quick)
+            tree = dataclasses.replace(refined.tree, levels=work.grid.levels)
+            _write(work, cells[number], dataclasses.replace(refined, tree=tree), early=True)
+        progress.show(next(done))
+
+    run_jobs(look, len(cells), quick.effort.threads)
+    work.place.list_cells()
+
+
 def _bake_cells(work: _Work, cells: list[tuple[int, int]], progress: Progress) -> list[_Counts]:
     """All cells, some of them at once, of which nothing stays in memory; the ones already there are only read."""
     progress.stage("Baking", STEPS * len(cells))
@@ -310,7 +350,7 @@ def _fill_cell(work: _Work, cell: tuple[int, int], found: Outline, show: Callabl
     for attempt in range(BUDGET_TRIES):
         last = attempt == BUDGET_TRIES - 1
         refined = refine(scene, found, work.judge, target, _part_of(show, attempt) if limit else show)
-        size = _write(work, cell, refined, 0 if last else limit)
+        size = _write(work, cell, refined, limit=0 if last else limit)
         if last or not limit or size <= limit:
             break
         points = int(refined.tree.size * BUDGET_MARGIN * limit / size)
@@ -333,7 +373,7 @@ def _part_of(show: Callable[[float], bool], attempt: int) -> Callable[[float], b
     return lambda share: show(1 - (2 - share) / 2 ** (attempt + 1))
 
 
-def _write(work: _Work, cell: tuple[int, int], refined: State, limit: int) -> int:
+def _write(work: _Work, cell: tuple[int, int], refined: State, limit: int = 0, early: bool = False) -> int:
     """Fit the data of a cell and write its files; their bytes."""
     light = fitted(work.scene, refined, work.target.effort.threads) if work.settings.fit else refined.measured.light
     measured, data = refined.measured, refined.data
@@ -342,7 +382,7 @@ def _write(work: _Work, cell: tuple[int, int], refined: State, limit: int) -> in
     fill = fills(shaded(refined, dim), light, work.judge) if light.shape[1] else None
     planes = of_cell(data.planes, data.plane, data.position, corner, dim, fill)
     payloads = split(work.scene, light)
-    return work.place.write_cell(refined.tree, payloads, measured.valid, measured.offset, planes, limit)
+    return work.place.write_cell(refined.tree, payloads, measured.valid, measured.offset, planes, limit, early)
 
 
 def _header(snapshot: Snapshot, settings: Settings, light: Model, scene: Scene, grid: Grid, identity: str) -> dict:

@@ -48,16 +48,19 @@ class Room:
 
     @contextlib.contextmanager
     def hold(self, amount: int) -> Iterator[None]:
-        """Wait until there is room.
+        """Wait until there is room; a job that waits has no share of the threads.
 
         Parameters
         ----------
         amount : int
             What the job holds.
         """
+        me = {threading.get_ident()} & _jobs
+        _jobs.difference_update(me)
         with self._changed:
             self._changed.wait_for(lambda: not self._held or self._held + amount <= self._limit)
             self._held += amount
+        _jobs.update(me)
         try:
             yield
         finally:

@@ -11,6 +11,7 @@ import json
 import shutil
 import tempfile
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -29,6 +30,9 @@ SNAPSHOT_NAME = "scene.giv"
 
 STAGING = ".gi_volumes_"
 """How the name begins of a folder where a cell's files lie until all of them are written."""
+
+LISTED_EVERY, LISTED_SHARE = 2.0, 50.0
+"""Least time between two lists of cells while others are baked [s], and in times that it takes to make one."""
 
 
 def check_target(target: Path) -> None:
@@ -114,7 +118,7 @@ class Place:
         self.target, self.identity, self.taken = target, header["bake"], False
         self._snapshot, self._header = snapshot, header
         self._staging: list[Path] = []
-        self._lock = threading.Lock()
+        self._lock, self._next = threading.Lock(), 0.0
         is_new = not target.exists()
         target.mkdir(parents=True, exist_ok=True)
         try:
@@ -139,10 +143,10 @@ class Place:
             return
         with self._stage() as staging:
             snapshot_file.save(self._snapshot, staging / SNAPSHOT_NAME)
-            content = folder.assemble(self.target, self._header)
+            cells = self.list_cells()
             self.taken = True
             (staging / SNAPSHOT_NAME).replace(self.target / SNAPSHOT_NAME)
-        listed = {file["name"] for entry in content["cells"] for file in entry["files"].values()}
+        listed = {file["name"] for entry in cells for file in entry["files"].values()}
         _remove_other_bakes(self.target, self.identity, listed)
 
     def close(self) -> list[dict]:
@@ -160,7 +164,7 @@ class Place:
         """
         for staging in self._staging:
             shutil.rmtree(staging, ignore_errors=True)
-        return folder.assemble(self.target, self._header)["cells"] if self.taken else []
+        return self.list_cells() if self.taken else []
 
     def write_cell(
         self,
@@ -170,6 +174,7 @@ class Place:
         offset: np.ndarray,
         planes: CellPlanes | None = None,
         limit: int = 0,
+        early: bool = False,
     ) -> int:
         """Put all files of a cell into the folder, or none; the tree, which makes a cell count, comes last. Several
         threads may write cells at once.
@@ -188,6 +193,8 @@ class Place:
             Occluding planes of the data points; none when left out.
         limit : int
             Files that take more bytes than this together are not put there; 0 for no limit.
+        early : bool
+            Whether the cell is a coarse one that will be replaced.
 
         Returns
         -------
@@ -200,7 +207,8 @@ class Place:
             A file cannot be written.
         """
         with self._stage() as staging:
-            folder.write_cell(staging, tree, payloads, valid, offset, {"bake": self.identity}, planes)
+            meta = {"bake": self.identity} | ({"early": True} if early else {})
+            folder.write_cell(staging, tree, payloads, valid, offset, meta, planes)
             size = sum(path.stat().st_size for path in staging.iterdir())
             if limit and size > limit:
                 return size
@@ -208,7 +216,31 @@ class Place:
                 self.take()
                 for path in sorted(staging.iterdir(), key=lambda path: path.suffix == ".tree"):
                     path.replace(self.target / path.name)
+                self._list_now_and_then()
         return size
+
+    def list_cells(self) -> list[dict]:
+        """List the cells that are there in `world.json`.
+
+        Returns
+        -------
+        list of dict
+            Their entries.
+
+        Raises
+        ------
+        OSError
+            The list cannot be written.
+        """
+        start = time.monotonic()
+        content = folder.assemble(self.target, self._header)
+        self._next = time.monotonic() + max(LISTED_EVERY, LISTED_SHARE * (time.monotonic() - start))
+        return content["cells"]
+
+    def _list_now_and_then(self) -> None:
+        """List the cells for those who watch, unless that was done a moment ago."""
+        if time.monotonic() >= self._next:
+            self.list_cells()
 
     @contextlib.contextmanager
     def _stage(self) -> Iterator[Path]:

@@ -114,6 +114,31 @@ def refine(
     return _Refinement(scene, outline, judge, target, progress).run()
 
 
+def sketch(scene: Scene, outline: Outline, judge: Judge, target: Target) -> State:
+    """Grow the tree of a cell by geometry alone, and look at it once.
+
+    Parameters
+    ----------
+    scene : Scene
+        What light travels through.
+    outline : Outline
+        What the tree could be.
+    judge : Judge
+        Not used for decisions here.
+    target : Target
+        Its error is 0.
+
+    Returns
+    -------
+    State
+        The same for any number of threads.
+    """
+    made = _Refinement(scene, outline, judge, target, None)
+    made.grow()
+    made.look(len(outline.coords) - 1)
+    return made.state
+
+
 class _Refinement:
     """One cell on its way: what has been decided, by level, and what has been measured."""
 

@@ -25,6 +25,7 @@ from .topology import NODE, Topology
 __all__ = [
     "PAYLOADS",
     "Cell",
+    "bake_of_cell",
     "cell_path",
     "describe_file",
     "has_cell",
@@ -113,7 +114,7 @@ def write_cell(
     offsets : (size, 3) int8
         Data point minus voxel centre, in voxel sizes / 254.
     meta : dict
-        Header fields; "bake" identifies what the values depend on.
+        Header fields; "bake" identifies what the values depend on, "early" marks a coarse cell that will be replaced.
     planes : CellPlanes, optional
         Occluding planes of the data points; none when left out.
 
@@ -267,7 +268,7 @@ def read_cell(folder: str | os.PathLike, cell: tuple[int, int]) -> Cell:
 
 
 def has_cell(folder: str | os.PathLike, cell: tuple[int, int], bake: str) -> bool:
-    """Say whether a cell is there, complete and undamaged, and belongs to a bake.
+    """Say whether a cell is there, complete and undamaged, belongs to a bake, and is baked to its end.
 
     Parameters
     ----------
@@ -281,12 +282,34 @@ def has_cell(folder: str | os.PathLike, cell: tuple[int, int], bake: str) -> boo
     Returns
     -------
     bool
-        False for anything missing, damaged or different.
+        False for anything missing, damaged or different, and for an early look at the cell.
     """
     try:
-        return read_cell(folder, cell).meta["bake"] == bake
+        meta = read_cell(folder, cell).meta
+        return meta["bake"] == bake and not meta.get("early", False)
     except (OSError, FileError):
         return False
+
+
+def bake_of_cell(folder: str | os.PathLike, cell: tuple[int, int]) -> str | None:
+    """Say which bake a cell belongs to, baked to its end or not.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Folder of the bake.
+    cell : (2,) int
+        World cell (i, j).
+
+    Returns
+    -------
+    str or None
+        What identifies the bake; None for a cell that is missing or damaged.
+    """
+    try:
+        return read_cell(folder, cell).meta["bake"]
+    except (OSError, FileError):
+        return None
 
 
 def describe_file(path: Path) -> dict:

@@ -17,12 +17,12 @@ from pathlib import Path
 import numpy as np
 
 from .atomic import write_bytes_atomically
-from .cells import TREE, Cell, cell_path, describe_file, has_cell, read_cell, read_tree, write_cell
+from .cells import TREE, Cell, bake_of_cell, cell_path, describe_file, has_cell, read_cell, read_tree, write_cell
 from .container import FileError
 from .grid import Grid
 from .topology import Topology
 
-__all__ = ["Cell", "assemble", "files", "grid_of", "has_cell", "load_header", "read_cell", "write_cell"]
+__all__ = ["Cell", "assemble", "bake_of_cell", "files", "grid_of", "has_cell", "load_header", "read_cell", "write_cell"]
 
 WORLD = "world.json"
 WORLD_FORMAT = "gi_volumes world"
@@ -175,7 +175,8 @@ def _describe_cell(folder: str | os.PathLike, topology: Topology, meta: dict, gr
     listed = meta["files"] | {TREE: describe_file(cell_path(folder, topology.cell, TREE))}
     keys = ("data_points", "valid_points", "left_out")
     entry = {"cell": list(topology.cell), "bounds": [low.tolist(), high.tolist()], "files": listed}
-    return entry | {key: meta[key] for key in keys} | {"dilated": meta.get("dilated", 0)}
+    entry |= {key: meta[key] for key in keys} | {"dilated": meta.get("dilated", 0)}
+    return entry | ({"early": True} if meta.get("early") else {})
 
 
 def _bounds(boxes: list) -> list | None:

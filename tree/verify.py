@@ -65,6 +65,9 @@ def _defects(path: Path, header: dict) -> Iterator[Defect]:
     listed = {tuple(entry["cell"]) for entry in header["cells"]}
     for entry in header["cells"]:
         yield from _cell_defects(path, entry, header["bake"])
+        if entry.get("early"):
+            what = f"cell {entry['cell'][0]},{entry['cell'][1]} is an early look: not baked to its end yet"
+            yield Defect(cell_path(path, entry["cell"], "tree").name, what)
     for cell in header.get("expected_cells", []):
         if tuple(cell) not in listed:
             yield Defect(cell_path(path, cell, "tree").name, f"cell {cell[0]},{cell[1]} is missing: not baked yet")

@@ -214,6 +214,58 @@ def test_a_bake_that_is_killed_is_completed_by_the_next_run(row, row_slow, tmp_p
     assert cells_only(tmp_path) == {name: data for name, data in row_slow.items() if name.startswith("cell_")}
 
 
+def stop(*_):
+    raise KeyboardInterrupt
+
+
+def looked_early(row: Path, target: Path) -> None:
+    """A bake that is stopped after its early look."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(job, "_bake_cells", stop)
+        with pytest.raises(KeyboardInterrupt):
+            call("bake", row, "-o", target, *QUICK, "--early")
+
+
+def test_an_early_look_shows_every_cell_and_counts_as_not_baked(row, row_baked, tmp_path):
+    looked_early(row, tmp_path / "early")
+    assert len(listed(tmp_path / "early")) == CELLS
+    defects = call("verify", tmp_path / "early", "--json").object["defects"]
+    assert [defect["file"] for defect in defects] == [f"cell_{i}_0.tree" for i in range(CELLS)]
+    assert all("early look" in defect["what"] for defect in defects)
+    asked = Points(tmp_path, *ground_points(100))
+    early, final = (asked.ask("query", tmp_path / "early"), asked.ask("query", row.parent / "whole"))
+    assert np.median(np.abs(early / final - 1)) < 0.3
+
+
+def test_a_bake_that_goes_on_after_an_early_look_is_the_same(row, row_baked, tmp_path):
+    looked_early(row, tmp_path)
+    succeed("bake", row, "-o", tmp_path, *QUICK, "--early")
+    assert content(tmp_path) == row_baked
+
+
+def test_no_early_look_takes_the_place_of_another_bake(row, tmp_path):
+    succeed("bake", row, "-o", tmp_path, *QUICK, "--seed", "9")
+    before = content(tmp_path)
+    looked_early(row, tmp_path)
+    assert content(tmp_path) == before
+
+
+def test_cells_close_to_the_camera_are_baked_first(row, tmp_path, monkeypatch):
+    order, write = [], job.Place.write_cell
+
+    def watched(self, tree, *given):
+        order.append(tree.cell)
+        return write(self, tree, *given)
+
+    monkeypatch.setattr(job.Place, "write_cell", watched)
+    there = yard(CELLS)
+    frame = np.array(there.cameras[0].world_from_camera).reshape(3, 4)
+    frame[0, 3] = 128 * CELLS
+    camera = dataclasses.replace(there.cameras[0], world_from_camera=tuple(frame.ravel().tolist()))
+    succeed("bake", stored(tmp_path, dataclasses.replace(there, cameras=(camera,))), "-o", tmp_path / "out", *QUICK)
+    assert order == [(i, 0) for i in reversed(range(CELLS))]
+
+
 def test_an_interruption_before_the_first_cell_leaves_another_bake_as_it_was(row, tmp_path, monkeypatch):
     succeed("bake", row, "-o", tmp_path, *QUICK)
     before = content(tmp_path)
