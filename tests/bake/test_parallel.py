@@ -74,6 +74,7 @@ def test_ctrl_c_stops_all_jobs():
 
     def interrupt() -> None:
         assert running.wait(PATIENCE_S)
+        time.sleep(0.2)  # until the pool has started all its threads
         _thread.interrupt_main()
 
     threading.Thread(target=interrupt).start()
