@@ -112,8 +112,9 @@ def _stop_like_ctrl_c() -> None:
 
 
 def _leave(code: int) -> NoReturn:
-    """End the process; one that holds Blender without its clean-up, which was seen to wait for ever after a render."""
-    if "bpy" in sys.modules:
+    """End the process; one that holds Blender without its clean-up, which was seen to wait for ever after a render, and
+    an interrupted one without waiting for threads in the middle of a long step."""
+    if "bpy" in sys.modules or code == INTERRUPTED:
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)

@@ -72,10 +72,8 @@ class Check:
         error : (views,) float64 ndarray
             Standard error of that.
         """
-        light = self.paths.mean(axis=0)
-        scale = np.where(light > 0, light, np.inf)
-        off = (self.cached + self.again) / 2 - self.paths
-        return off.mean(axis=0) / scale, off.std(axis=0, ddof=1) / np.sqrt(len(off)) / scale
+        off, doubt, scale = self._off()
+        return off / scale, doubt / scale
 
     def noise(self) -> np.ndarray:
         """Say how noisy data points are by the cache, before they are fitted.
@@ -95,18 +93,29 @@ class Check:
         Parameters
         ----------
         error : float
-            Target error of the bake.
+            Target error of the bake, relative to all light together.
 
         Returns
         -------
         bool
-            Whether the bias of all light together is larger, beyond doubt.
+            Whether the bias of any view, or of all of them together, is larger, beyond doubt; or not a number.
         """
         if len(self.paths) < 2:
             return False
-        whole = Check(*(part.sum(axis=1, keepdims=True) for part in (self.cached, self.paths, self.again)))
-        bias, doubt = whole.bias()
-        return bool(abs(bias[0]) > error + SURE * doubt[0])
+        parts = (self.cached, self.paths, self.again)
+        off, doubt, _ = Check(*(np.column_stack([part, part.sum(axis=1)]) for part in parts))._off()
+        return not (np.abs(off) <= error * self.paths.sum(axis=1).mean() + SURE * doubt).all()
+
+    def _off(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(views,) how far off means are, the standard error of that, and the light that it is relative to.
+
+        The error is that of a ratio: a cache that is off by the same factor everywhere is known to be so exactly,
+        however uneven the light is (Cochran 1977, "Sampling Techniques", section 2.11).
+        """
+        light, off = self.paths.mean(axis=0), (self.cached + self.again) / 2 - self.paths
+        scale = np.where(light > 0, light, np.inf)
+        residual = off - off.mean(axis=0) / scale * self.paths
+        return off.mean(axis=0), residual.std(axis=0, ddof=1) / np.sqrt(len(off)), scale
 
 
 def check(cached: Scene, scene: Scene, cell: Outline, judge: Judge, effort: Effort) -> Check:

@@ -12,7 +12,6 @@ Every function and channel is a column; the operator is the same for all, so the
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -20,6 +19,7 @@ import numpy as np
 
 from ..tree import harmonics
 from .normal_equations import Operator, Solver
+from .parallel import run_tiles
 
 __all__ = ["PRIOR", "System", "evaluate", "fit", "trust"]
 
@@ -141,11 +141,11 @@ def fit(
     size = max(1, min(COLUMNS, COLUMN_TAPS // max(system.operator.taps, 1)))
     parts = [slice(first, first + size) for first in range(0, count, size)]
 
-    def work(part: slice) -> None:
+    def work(part: slice) -> int:
         out[:, :, part] = solver.solve(columns[:, :, part], flat[:, part])
+        return 1
 
-    with ThreadPoolExecutor(max(threads, 1)) as pool:
-        list(pool.map(work, parts))
+    run_tiles(work, parts, threads)
     return np.ascontiguousarray(out.reshape(system.points, harmonics.COUNT, count // 3, 3).transpose(0, 2, 1, 3))
 
 

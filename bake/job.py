@@ -28,7 +28,7 @@ from .check import Check, check
 from .fills import fills
 from .gather import Effort
 from .measured import split
-from .parallel import CancelledError, Room, run_jobs
+from .parallel import CancelledError, Room, held, run_jobs
 from .place import Place, check_target
 from .progress import Progress
 from .reference import sun_strength
@@ -72,6 +72,9 @@ TOGETHER = 3 << 17
 
 EARLY_LEVELS, EARLY_SAMPLES, EARLY_BOUNCES = 2, 64, 6
 """Levels, paths and bounces of an early look: voxels of 2 m, within seconds."""
+
+WHITE = np.array([[np.sqrt(4 * np.pi)] * 3] + [[0.0] * 3] * 8)
+"""Harmonics of a sky of radiance 1 W/(m2 sr)."""
 
 STEPS = 1000
 """Units of progress in a cell."""
@@ -162,7 +165,7 @@ def bake(
         trees = _bake_cells(work, wanted, progress)
         place.take()
     finally:
-        listed = place.close()
+        listed = [entry for entry in place.close() if not entry.get("early")]
     outcome = _describe(snapshot, settings, light, scene, trees)
     outcome.voxels = {"first": grid.first_size, "finest": float(grid.voxel_size(grid.levels - 1))}
     if not settings.finest and grid.first_size != FIRST_SIZE:
@@ -244,7 +247,7 @@ class _Work:
         if np.ptp(bounds[:, :2], axis=0).max() > self.grid.cell_size:
             dense = np.stack([cell.dense.low, cell.dense.low + cell.dense.shape]) * self.grid.first_size
             return radiosity.around(self.scene, self.grid, dense, effort, lambda share: show(CACHED * share))
-        with self.lock:
+        with held(self.lock):
             if not self.shared:
                 box = np.stack([bounds[0], np.nextafter(bounds[1], np.inf)])
                 found = radiosity.around(self.scene, self.grid, box, effort, lambda share: show(CACHED * share))
@@ -263,10 +266,12 @@ class _Work:
 
 
 def _judge(snapshot: Snapshot, settings: Settings, scene: Scene) -> Judge:
-    """Local light, sun and sky as they are when nobody says otherwise; of a free sun the mean of its directions."""
+    """Local light, sun and sky as they are when nobody says otherwise; of a free sun the mean of its directions; for
+    functions of a black sky a white one."""
     suns = len(scene.model.suns.toward)
     strength = sun_strength(snapshot, suns) / (max(suns, 1) if has_free_sun(settings.sun) else 1)
     sky = scene.sky.harmonics() if scene.model.sky == "harmonics" else np.ones((scene.model.sky_count, 3))
+    sky = sky if sky.any() else WHITE[: len(sky)]
     parts = [np.ones((int(scene.has_local), 3)), strength if suns else np.zeros((0, 3)), sky]
     views = []
     for number, part in enumerate(parts):
@@ -297,7 +302,7 @@ def _look_early(work: _Work, cells: list[tuple[int, int]], progress: Progress) -
     grid = dataclasses.replace(work.grid, levels=min(EARLY_LEVELS, work.grid.levels))
     effort = dataclasses.replace(work.target.effort, samples=EARLY_SAMPLES, bounces=EARLY_BOUNCES)
     quick = dataclasses.replace(work.target, error=0.0, effort=effort, samples=RECEIVER_SAMPLES)
-    done = itertools.count(1)
+    done, lock = itertools.count(1), threading.Lock()
 
     def look(number: int) -> None:
         if folder.bake_of_cell(work.place.target, cells[number]) != work.place.identity:
@@ -306,7 +311,8 @@ def _look_early(work: _Work, cells: list[tuple[int, int]], progress: Progress) -
             refined = sketch(work.scene, found, work.judge, quick)
             tree = dataclasses.replace(refined.tree, levels=work.grid.levels)
             _write(work, cells[number], dataclasses.replace(refined, tree=tree), early=True)
-        progress.show(next(done))
+        with lock:
+            progress.show(next(done))
 
     run_jobs(look, len(cells), quick.effort.threads)
     work.place.list_cells()
@@ -453,7 +459,10 @@ def _describe_checks(work: _Work, transports: list[str]) -> list[dict]:
         return []
     (bias, error), noise = made.bias(), made.noise()
     parts = {"bias": bias, "bias_error": error, "noise": noise}
-    figures = ({key: round(float(part[number]), 5) for key, part in parts.items()} for number in range(len(bias)))
+    figures = (
+        {key: round(float(np.nan_to_num(part[number], nan=np.inf)), 5) for key, part in parts.items()}
+        for number in range(len(bias))
+    )
     return [{"what": name, "places": len(made.paths)} | row for name, row in zip(transports, figures, strict=True)]
 
 

@@ -1,14 +1,13 @@
 """Threads: tiles of one stage, and whole jobs at once; embreex and numpy release Python's lock while they compute.
 
 Jobs that run at once share the threads, so that there are about as many as processors: more of them, and smaller
-tiles, spend their time on handing Python's lock around. When work fails or the user stops it, all threads get a
-`CancelledError` at their next instruction.
+tiles, spend their time on handing Python's lock around. When work fails or the user stops it, all threads are told to
+stop, and raise `CancelledError` at their next `check`.
 """
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
 import threading
 from collections.abc import Callable, Iterator
@@ -24,18 +23,38 @@ VALUES = 1 << 21
 """Lanes times functions of light of a tile, at most: 24 MB, and a few times that in flight."""
 
 PATIENCE = 0.2
-"""How often the main thread looks for Ctrl-C [s]; on Windows nothing wakes it sooner."""
+"""How often threads that wait look whether they are to stop [s]; on Windows nothing wakes the main thread sooner."""
+
+GRACE = 0.5
+"""How long Ctrl-C waits for jobs [s]; those in the middle of a long step end by themselves, and nobody takes their
+results."""
 
 _jobs: set[int] = set()
-"""Threads that run jobs."""
+"""Threads that run jobs, and do not wait for others."""
+
+_local = threading.local()
+"""Of each thread of a pool the `stops`: events that tell it to stop."""
 
 
 class CancelledError(Exception):
     """The caller asked to stop; nothing of the unfinished work is kept."""
 
 
+def check() -> None:
+    """Look whether this thread is to stop; long work calls it now and then.
+
+    Raises
+    ------
+    CancelledError
+        It is.
+    """
+    if any(stop.is_set() for stop in getattr(_local, "stops", ())):
+        raise CancelledError
+
+
 class Room:
-    """Lets jobs in as long as what they hold together is small enough; a single one may be as large as it likes.
+    """Lets jobs in, first come first served, as long as what they hold together is small enough; a single one may be
+    as large as it likes.
 
     Parameters
     ----------
@@ -44,29 +63,73 @@ class Room:
     """
 
     def __init__(self, limit: int) -> None:
-        self._limit, self._held, self._changed = limit, 0, threading.Condition()
+        self._limit, self._held, self._queue, self._changed = limit, 0, [], threading.Condition()
 
     @contextlib.contextmanager
     def hold(self, amount: int) -> Iterator[None]:
-        """Wait until there is room; a job that waits has no share of the threads.
+        """Wait until there is room.
 
         Parameters
         ----------
         amount : int
             What the job holds.
+
+        Raises
+        ------
+        CancelledError
+            The job is to stop.
         """
-        me = {threading.get_ident()} & _jobs
-        _jobs.difference_update(me)
-        with self._changed:
-            self._changed.wait_for(lambda: not self._held or self._held + amount <= self._limit)
-            self._held += amount
-        _jobs.update(me)
+        ticket = object()
+        with _aside(), self._changed:
+            self._queue.append(ticket)
+            try:
+                while self._queue[0] is not ticket or (self._held and self._held + amount > self._limit):
+                    check()
+                    self._changed.wait(PATIENCE)
+                self._held += amount
+            finally:
+                self._queue.remove(ticket)
+                self._changed.notify_all()
         try:
             yield
         finally:
             with self._changed:
                 self._held -= amount
                 self._changed.notify_all()
+
+
+@contextlib.contextmanager
+def held(lock: threading.Lock) -> Iterator[None]:
+    """Hold a lock; a job that waits for it has no share of the threads.
+
+    Parameters
+    ----------
+    lock : Lock
+        The lock.
+
+    Raises
+    ------
+    CancelledError
+        The job is to stop.
+    """
+    with _aside():
+        while not lock.acquire(timeout=PATIENCE):
+            check()
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+@contextlib.contextmanager
+def _aside() -> Iterator[None]:
+    """Leave a job's share of the threads to the others."""
+    me = {threading.get_ident()} & _jobs
+    _jobs.difference_update(me)
+    try:
+        yield
+    finally:
+        _jobs.update(me)
 
 
 def number_of(threads: int) -> int:
@@ -145,6 +208,7 @@ def run_tiles(
     with _pool(number_of(threads)) as submit:
         pending = {submit(work, tile) for tile in tiles}
         while pending:
+            check()
             finished, pending = wait(pending, PATIENCE, FIRST_COMPLETED)
             done += sum(future.result() for future in finished)
             if finished and progress is not None and not progress(done):
@@ -171,7 +235,7 @@ def run_jobs(work: Callable[[int], object], count: int, threads: int) -> list:
     Raises
     ------
     BaseException
-        The first that a job raised, or that arrived here (Ctrl-C); the other jobs have ended by then.
+        The first that a job raised; the others have ended by then. Or Ctrl-C, which waits `GRACE` for them.
     """
     at_once = min(count, number_of(threads))
     if at_once <= 1:
@@ -184,7 +248,7 @@ def run_jobs(work: Callable[[int], object], count: int, threads: int) -> list:
         finally:
             _jobs.discard(threading.get_ident())
 
-    with _pool(at_once) as submit:
+    with _pool(at_once, GRACE) as submit:
         pending = futures = [submit(job, number) for number in range(count)]
         while pending:
             finished, pending = wait(pending, PATIENCE, FIRST_EXCEPTION)
@@ -194,22 +258,30 @@ def run_jobs(work: Callable[[int], object], count: int, threads: int) -> list:
 
 
 @contextlib.contextmanager
-def _pool(threads: int) -> Iterator[Callable[..., Future]]:
-    """A function that runs calls on threads; whatever raises here, or in one of them, stops the others."""
-    running: set[int] = set()
+def _pool(threads: int, grace: float | None = None) -> Iterator[Callable[..., Future]]:
+    """A function that runs calls on threads; whatever raises here, or in one of them, stops the others. After Ctrl-C
+    it waits for them no longer than that, if there is a grace."""
+    stop, outer, futures = threading.Event(), getattr(_local, "stops", ()), []
 
     def call(work: Callable, item: object) -> object:
-        running.add(threading.get_ident())
-        try:
-            return work(item)
-        finally:
-            running.discard(threading.get_ident())
+        _local.stops = (*outer, stop)
+        check()
+        return work(item)
 
-    with ThreadPoolExecutor(threads) as pool:
-        try:
-            yield lambda work, item: pool.submit(call, work, item)
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for thread in list(running):
-                ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), ctypes.py_object(CancelledError))
-            raise
+    def submit(work: Callable, item: object) -> Future:
+        futures.append(pool.submit(call, work, item))
+        return futures[-1]
+
+    pool = ThreadPoolExecutor(threads)
+    try:
+        yield submit
+    except KeyboardInterrupt:
+        stop.set()
+        pool.shutdown(wait=grace is None, cancel_futures=True)
+        wait([future for future in futures if not future.cancelled()], grace)
+        raise
+    except BaseException:
+        stop.set()
+        pool.shutdown(cancel_futures=True)
+        raise
+    pool.shutdown()

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..tree import harmonics
 from . import lit_spots, warp
+from .parallel import check
 from .rays import MISS, Hits
 from .scene import Scene
 from .sobol import Sampler
@@ -288,6 +289,7 @@ def _follow(
     """Follow paths from one vertex to another, these included."""
     first, last = limits
     for bounce in range(first, last + 1):
+        check()
         wave, hits, travelled = _advance(scene, wave, numbers, bounce, light)
         if not len(wave.lane):
             break

@@ -11,7 +11,6 @@ import json
 import shutil
 import tempfile
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from ..tree.planes import CellPlanes
 from ..tree.topology import Topology
 from ..tree.verify import Defect
 from . import snapshot_file
+from .parallel import CancelledError
 from .settings import SettingsError
 from .snapshot import Snapshot
 
@@ -30,9 +30,6 @@ SNAPSHOT_NAME = "scene.giv"
 
 STAGING = ".gi_volumes_"
 """How the name begins of a folder where a cell's files lie until all of them are written."""
-
-LISTED_EVERY, LISTED_SHARE = 2.0, 50.0
-"""Least time between two lists of cells while others are baked [s], and in times that it takes to make one."""
 
 
 def check_target(target: Path) -> None:
@@ -118,7 +115,7 @@ class Place:
         self.target, self.identity, self.taken = target, header["bake"], False
         self._snapshot, self._header = snapshot, header
         self._staging: list[Path] = []
-        self._lock, self._next = threading.Lock(), 0.0
+        self._lock, self._early, self._closed = threading.RLock(), set(), False
         is_new = not target.exists()
         target.mkdir(parents=True, exist_ok=True)
         try:
@@ -150,7 +147,7 @@ class Place:
         _remove_other_bakes(self.target, self.identity, listed)
 
     def close(self) -> list[dict]:
-        """List the cells that are there, and leave nothing else.
+        """List the cells that are there, and leave nothing else; no thread can write any more.
 
         Returns
         -------
@@ -162,9 +159,11 @@ class Place:
         OSError
             The list cannot be written.
         """
-        for staging in self._staging:
-            shutil.rmtree(staging, ignore_errors=True)
-        return self.list_cells() if self.taken else []
+        with self._lock:
+            self._closed = True
+            for staging in self._staging:
+                shutil.rmtree(staging, ignore_errors=True)
+            return self.list_cells() if self.taken else []
 
     def write_cell(
         self,
@@ -205,6 +204,8 @@ class Place:
         ------
         OSError
             A file cannot be written.
+        CancelledError
+            The folder is closed.
         """
         with self._stage() as staging:
             meta = {"bake": self.identity} | ({"early": True} if early else {})
@@ -213,10 +214,15 @@ class Place:
             if limit and size > limit:
                 return size
             with self._lock:
+                if self._closed:
+                    raise CancelledError
                 self.take()
+                if tree.cell in self._early:
+                    folder.cell_path(self.target, tree.cell, folder.TREE).unlink(missing_ok=True)
                 for path in sorted(staging.iterdir(), key=lambda path: path.suffix == ".tree"):
                     path.replace(self.target / path.name)
-                self._list_now_and_then()
+                if tree.cell in self._early:
+                    self.list_cells()
         return size
 
     def list_cells(self) -> list[dict]:
@@ -232,21 +238,18 @@ class Place:
         OSError
             The list cannot be written.
         """
-        start = time.monotonic()
-        content = folder.assemble(self.target, self._header)
-        self._next = time.monotonic() + max(LISTED_EVERY, LISTED_SHARE * (time.monotonic() - start))
-        return content["cells"]
-
-    def _list_now_and_then(self) -> None:
-        """List the cells for those who watch, unless that was done a moment ago."""
-        if time.monotonic() >= self._next:
-            self.list_cells()
+        cells = folder.assemble(self.target, self._header)["cells"]
+        self._early = {tuple(entry["cell"]) for entry in cells if entry.get("early")}
+        return cells
 
     @contextlib.contextmanager
     def _stage(self) -> Iterator[Path]:
         """A folder for files that nobody may see yet; `close` removes what an interruption leaves of it."""
-        staging = Path(tempfile.mkdtemp(prefix=STAGING, dir=self.target))
-        self._staging.append(staging)
+        with self._lock:
+            if self._closed:
+                raise CancelledError
+            staging = Path(tempfile.mkdtemp(prefix=STAGING, dir=self.target))
+            self._staging.append(staging)
         try:
             yield staging
         finally:

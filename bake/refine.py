@@ -23,7 +23,7 @@ from ..tree.lookup import Atlas
 from ..tree.outline import Outline
 from ..tree.region import finder
 from ..tree.topology import Topology
-from . import judges, occluders, receivers
+from . import judges, occluders, parallel, receivers
 from .datapoints import FARTHEST_STEP
 from .gather import Effort
 from .measured import measure, move
@@ -199,6 +199,7 @@ class _Refinement:
     def hide(self, at: Receivers) -> None:
         """Planes for all data points, as some receivers see them: those with light on the way, as they are there; in
         the end denser ones on all surfaces that the cell may light, those of other cells too."""
+        parallel.check()
         hidden = occluders.fit(self.scene, self.state.data, at, self.target.effort.threads)
         data = dataclasses.replace(self.state.data, planes=hidden.planes, plane=hidden.plane)
         self.state = dataclasses.replace(self.state, data=data)
@@ -282,6 +283,7 @@ class _Refinement:
 
     def show(self) -> Callable[[float], bool] | None:
         """What the next stage is to call with the part of it that is done; each level has up to three."""
+        parallel.check()
         show, stage, count = self.progress, self.stage, 3 * self.grid.levels
         self.stage += 1
         return None if show is None else lambda share: show((stage + share) / count)

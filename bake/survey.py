@@ -20,7 +20,6 @@ from . import fit, fit_error, reference
 from .gather import Effort
 from .lamps import LUMINANCE
 from .measured import Measured, functions, split, stack
-from .parallel import number_of
 from .receivers import FIELDS, Receivers
 from .scene import Scene
 
@@ -191,7 +190,7 @@ def squared_errors(state: State, judge: Judge, threads: int) -> tuple[np.ndarray
     stored, halves = np.ascontiguousarray(np.moveaxis(stored, 2, 1)), _views(state.seen.light, judge)
     if len(use):
         prior = fit.trust(system, stored, halves[:, use])
-        stored = fit.fit(system, stored, halves[:, use].mean(axis=0), prior, number_of(threads))
+        stored = fit.fit(system, stored, halves[:, use].mean(axis=0), prior, threads)
     one, other = _received(state, stored) - halves
     squared = (one * other).sum(axis=(1, 2))
     if len(use):
@@ -339,7 +338,7 @@ def _system(state: State) -> tuple[np.ndarray, fit.System | None]:
 def _fit(system: fit.System, traced: np.ndarray, halves: np.ndarray, threads: int) -> np.ndarray:
     """Fit to the mean of the halves; what they differ by says how far to trust the traced values."""
     prior = fit.trust(system, traced, halves)
-    return fit.fit(system, traced, halves.mean(axis=0), prior, number_of(threads))
+    return fit.fit(system, traced, halves.mean(axis=0), prior, threads)
 
 
 def _received(state: State, values: np.ndarray) -> np.ndarray:

@@ -66,6 +66,36 @@ def test_the_number_of_threads_changes_nothing(parts):
     assert (one.paths == two.paths).all()
 
 
+def light(sigma: float, views: int = 1) -> np.ndarray:
+    """Uneven light at 128 places."""
+    return np.random.default_rng(3).lognormal(0, sigma, (128, views))
+
+
+def test_the_standard_error_does_not_count_how_uneven_light_is():
+    truth = light(2.0)
+    bias, error = Check(1.5 * truth, truth, 1.5 * truth).bias()
+    assert bias == pytest.approx([0.5])
+    assert error == pytest.approx([0], abs=1e-12)
+    noise = np.random.default_rng(4).normal(0, 0.1, (128, 1))
+    bias, error = Check(truth + noise, truth, truth + noise).bias()
+    assert error == pytest.approx([0.1 / np.sqrt(128) / truth.mean()], rel=0.2)
+
+
+@pytest.mark.parametrize(
+    ("cached", "paths"),
+    [
+        (1.5 * light(2.0), light(2.0)),
+        (np.ones((128, 1)), np.zeros((128, 1))),
+        (np.where(np.arange(128)[:, None] == 5, np.nan, 1.0), np.ones((128, 1))),
+        (light(1.0, 2) * (2.0, 1 / 3), light(1.0, 2) * (1.0, 1.5)),
+    ],
+    ids=["a factor", "light where there is none", "not a number", "errors that cancel"],
+)
+def test_a_cache_that_is_wrong_fails(cached, paths):
+    assert Check(cached, paths, cached).fails(0.1)
+    assert not Check(paths, paths, paths).fails(0.1)
+
+
 def test_checks_of_cells_are_joined():
     part = Check(*(np.full((3, 2), value) for value in (1.0, 2.0, 1.0)))
     bias, error = Check.join([part, part], 2).bias()

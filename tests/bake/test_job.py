@@ -18,7 +18,9 @@ import numpy as np
 import pytest
 from command_line import QUICK, Points, call, cells_only, content, ground_points, stored, succeed, yard
 from gi_volumes.bake import job
-from gi_volumes.bake.settings import Settings, SettingsError
+from gi_volumes.bake.parallel import CancelledError
+from gi_volumes.bake.scene import prepare
+from gi_volumes.bake.settings import Settings, SettingsError, model
 from gi_volumes.tree import container
 from statistics_checks import standard_error
 
@@ -241,6 +243,49 @@ def test_a_bake_that_goes_on_after_an_early_look_is_the_same(row, row_baked, tmp
     looked_early(row, tmp_path)
     succeed("bake", row, "-o", tmp_path, *QUICK, "--early")
     assert content(tmp_path) == row_baked
+
+
+def test_cells_with_an_early_look_alone_are_named_as_not_baked(row, tmp_path):
+    looked_early(row, tmp_path)
+    result = succeed("bake", row, "-o", tmp_path, *QUICK, "--cells", "0,0")
+    assert [text for text in result["warnings"] if "not baked" in text] == [
+        "2 of the scene's 3 cells are not baked yet"
+    ]
+    assert [defect["file"] for defect in call("verify", tmp_path, "--json").object["defects"]] == [
+        "cell_1_0.tree",
+        "cell_2_0.tree",
+    ]
+
+
+def test_the_list_of_cells_is_right_as_soon_as_a_cell_takes_the_place_of_its_early_look(row, tmp_path, monkeypatch):
+    looked_early(row, tmp_path)
+    write, defects = job.Place.write_cell, []
+
+    def watched(self, *given):
+        size = write(self, *given)
+        defects.append(len(call("verify", tmp_path, "--json").object["defects"]))
+        return size
+
+    monkeypatch.setattr(job.Place, "write_cell", watched)
+    succeed("bake", row, "-o", tmp_path, *QUICK)
+    assert defects == [2, 1, 0]
+
+
+def test_nothing_is_written_once_the_folder_is_closed(row, tmp_path, monkeypatch):
+    made, init = [], job.Place.__init__
+    monkeypatch.setattr(job.Place, "__init__", lambda self, *given: made.append(self) or init(self, *given))
+    succeed("bake", row, "-o", tmp_path, *QUICK)
+    before = content(tmp_path)
+    with pytest.raises(CancelledError):
+        made[0].write_cell(None, {}, None, None)
+    assert content(tmp_path) == before
+
+
+def test_a_black_sky_of_functions_is_judged_as_a_white_one():
+    snapshot, settings = yard(sky=(0.0, 0.0, 0.0)), Settings(sky="harmonics")
+    snapshot, light = model(snapshot, settings)
+    judge = job._judge(snapshot, settings, prepare(snapshot, light))
+    assert judge.mean[-9:, 0].tolist() == pytest.approx([np.sqrt(4 * np.pi)] + [0] * 8)
 
 
 def test_no_early_look_takes_the_place_of_another_bake(row, tmp_path):

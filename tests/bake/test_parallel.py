@@ -16,12 +16,12 @@ PATIENCE_S = 20.0
 
 
 def until(event: threading.Event, ended: list) -> None:
-    """Work that only an exception ends, and that says which."""
+    """Work that looks whether it is to stop, and says how it ended."""
     start = time.monotonic()
     try:
         event.set()
         while time.monotonic() < start + PATIENCE_S:
-            sum(range(100))
+            parallel.check()
     except BaseException as error:
         ended.append(type(error))
         raise
@@ -83,6 +83,45 @@ def test_ctrl_c_stops_all_jobs():
         run_jobs(lambda _: until(running, ended), 2, 2)
     assert time.monotonic() - start < PATIENCE_S / 2
     assert set(ended) == {CancelledError}
+
+
+def test_ctrl_c_does_not_wait_for_a_job_in_the_middle_of_a_long_step():
+    running, over = threading.Event(), threading.Event()
+
+    def interrupt() -> None:
+        assert running.wait(PATIENCE_S)
+        time.sleep(0.2)  # until the pool has started all its threads
+        _thread.interrupt_main()
+
+    def work(_: int) -> None:
+        running.set()
+        assert over.wait(PATIENCE_S)
+
+    threading.Thread(target=interrupt).start()
+    start = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        run_jobs(work, 2, 2)
+    assert time.monotonic() - start < PATIENCE_S / 2
+    over.set()
+
+
+def test_hundreds_of_failures_in_the_middle_of_stages_leave_no_thread_behind():
+    before = threading.active_count()
+    for _ in range(300):
+        begun = threading.Event()
+
+        def work(number: int, begun=begun) -> None:
+            if number == 0:
+                assert begun.wait(PATIENCE_S)
+                raise OSError("no space")
+            while True:
+                begun.set()
+                run_tiles(len, tiles(4, 1), 2)
+
+        with pytest.raises(OSError, match="no space"):
+            run_jobs(work, 3, 3)
+    assert threading.active_count() == before
+    assert not parallel._jobs
 
 
 def test_jobs_that_run_at_once_share_the_threads():
