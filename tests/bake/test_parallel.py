@@ -103,6 +103,9 @@ def test_ctrl_c_does_not_wait_for_a_job_in_the_middle_of_a_long_step():
         run_jobs(work, 2, 2)
     assert time.monotonic() - start < PATIENCE_S / 2
     over.set()
+    while parallel._jobs:  # they would take a share of the next test's threads
+        assert time.monotonic() < start + PATIENCE_S
+        time.sleep(0.01)
 
 
 def test_hundreds_of_failures_in_the_middle_of_stages_leave_no_thread_behind():
