@@ -23,7 +23,7 @@ from ..tree.grid import FIRST_SIZE, Grid
 from ..tree.outline import Outline, outline
 from ..tree.planes import of_cell
 from ..tree.topology import Topology
-from . import radiosity, snapshot_file
+from . import radiosity, snapshot_file, summary
 from .check import Check, check
 from .fills import fills
 from .gather import Effort
@@ -33,7 +33,7 @@ from .place import Place, check_target
 from .progress import Progress
 from .reference import sun_strength
 from .refine import Target, refine, sketch
-from .scene import Model, Scene, prepare, scene_suns
+from .scene import Model, Scene, prepare
 from .settings import (
     ERRORS,
     LEVELS,
@@ -47,6 +47,7 @@ from .settings import (
     model,
 )
 from .snapshot import Snapshot
+from .summary import Outcome
 from .survey import Judge, State, fitted, shade, shaded
 
 FORMAT = "gi_volumes bake 3"
@@ -78,24 +79,6 @@ WHITE = np.array([[np.sqrt(4 * np.pi)] * 3] + [[0.0] * 3] * 8)
 
 STEPS = 1000
 """Units of progress in a cell."""
-
-
-@dataclass
-class Outcome:
-    """What a bake did, as the command line's JSON object."""
-
-    triangles: int = 0
-    cells: int = 0
-    data_points: int = 0
-    dilated: int = 0
-    bytes: dict[str, int] = field(default_factory=dict)
-    seconds: dict[str, float] = field(default_factory=dict)
-    rays: int = 0
-    voxels: dict[str, float] = field(default_factory=dict)
-    modelled: list[str] = field(default_factory=list)
-    left_out: list[dict[str, str]] = field(default_factory=list)
-    checked: list[dict] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
 
 
 def bake(
@@ -152,7 +135,7 @@ def bake(
     levels = LEVELS if settings.error else LEVELS - 1
     grid = choose_grid(scene.soup.corners, snapshot.origin, settings.finest, levels)
     occupied = [tuple(int(v) for v in cell) for cell in build.occupied_cells(scene.soup.corners, grid)]
-    header = _header(snapshot, settings, light, scene, grid, identity) | {"expected_cells": occupied}
+    header = summary.header(snapshot, settings, scene, grid, identity) | {"expected_cells": occupied}
     wanted = _in_view(snapshot, grid, _wanted(cells, occupied))
     place = Place(target, snapshot, header)
     effort = Effort(settings.samples, settings.bounces, settings.seed, threads)
@@ -166,19 +149,22 @@ def bake(
         place.take()
     finally:
         listed = [entry for entry in place.close() if not entry.get("early")]
-    outcome = _describe(snapshot, settings, light, scene, trees)
+    outcome = summary.describe(snapshot, settings, scene, trees)
     outcome.voxels = {"first": grid.first_size, "finest": float(grid.voxel_size(grid.levels - 1))}
     if not settings.finest and grid.first_size != FIRST_SIZE:
         outcome.warnings.append(
             f"first-level voxels of {grid.first_size:g} m suit this scene's size; --finest changes it"
         )
-    outcome.checked = _describe_checks(work, list(header["transports"]))
+    made = Check.join([work.checks[cell] for cell in sorted(work.checks)], len(work.judge.views))
+    outcome.checked = summary.checked(made, list(header["transports"]))
     outcome.warnings += sorted(work.warnings)
+    if len(work.arriving) == len(wanted):
+        outcome.warnings += summary.dark(list(header["transports"]), list(work.arriving.values()))
     if len(listed) < len(occupied):
         outcome.warnings.append(f"{len(occupied) - len(listed)} of the scene's {len(occupied)} cells are not baked yet")
     outcome.seconds = progress.seconds
     outcome.rays = scene.tracer.rays
-    outcome.bytes = _file_sizes(listed)
+    outcome.bytes = summary.file_sizes(listed)
     return outcome
 
 
@@ -234,6 +220,7 @@ class _Work:
     room: Room
     warnings: list[str] = field(default_factory=list)
     shared: list[Scene] = field(default_factory=list)
+    arriving: dict[tuple[int, int], set[str]] = field(default_factory=dict)
     checks: dict[tuple[int, int], Check] = field(default_factory=dict)
     lock: threading.Lock = field(default_factory=threading.Lock)
 
@@ -388,91 +375,8 @@ def _write(work: _Work, cell: tuple[int, int], refined: State, limit: int = 0, e
     fill = fills(shaded(refined, dim), light, work.judge) if light.shape[1] else None
     planes = of_cell(data.planes, data.plane, data.position, corner, dim, fill)
     payloads = split(work.scene, light)
+    work.arriving[cell] = {name for name, part in payloads.items() if part.any()}
     return work.place.write_cell(refined.tree, payloads, measured.valid, measured.offset, planes, limit, early)
-
-
-def _header(snapshot: Snapshot, settings: Settings, light: Model, scene: Scene, grid: Grid, identity: str) -> dict:
-    """What `world.json` says besides the cells."""
-    transports: dict[str, dict] = {}
-    if scene.has_local:
-        transports["local"] = {"unit": "W/m2"}
-    if len(light.suns.toward):
-        transports["sun"] = _sun_header(snapshot, settings, light)
-    if light.sky != "none":
-        transports["sky"] = {"kind": light.sky, "unit": "W/m2"}
-    if light.sky == "harmonics":
-        transports["sky"] |= {"unit": "sr", "radiance": scene.sky.harmonics().tolist()}
-    return {
-        "bake": identity,
-        "snapshot": snapshot_file.digest(snapshot),
-        "source": snapshot.source,
-        "settings": dataclasses.asdict(settings),
-        "grid": grid,
-        "transports": transports,
-    }
-
-
-def _sun_header(snapshot: Snapshot, settings: Settings, light: Model) -> dict:
-    """Key directions, and the suns that shine when nobody says otherwise: the scene's, or the one asked for."""
-    shining = (scene_suns(snapshot) if has_free_sun(settings.sun) else light.suns).toward
-    strength = sun_strength(snapshot, len(shining))
-    return {
-        "unit": "1, irradiance per W/m2 of sun on a surface facing it",
-        "directions": light.suns.toward.tolist(),
-        "diameters": light.suns.diameter.tolist(),
-        "free": has_free_sun(settings.sun),
-        "scene": [
-            {"direction": direction.tolist(), "irradiance": irradiance.tolist()}
-            for direction, irradiance in zip(shining, strength, strict=True)
-        ],
-    }
-
-
-def _describe(snapshot: Snapshot, settings: Settings, light: Model, scene: Scene, trees: list[Topology]) -> Outcome:
-    """Counts, what was modelled, and what was left out and why."""
-    outcome = Outcome(len(scene.soup.corners), len(trees), sum(tree.size for tree in trees))
-    outcome.dilated = sum(tree.dilated for tree in trees)
-    parts = {
-        "local": (scene.has_local, "the scene has no lamps and no emissive surfaces"),
-        "sun": (len(light.suns.toward) > 0, "there is no sun, or none was asked for"),
-        "sky": (light.sky != "none", "the sky is black"),
-        "probes": (False, "specular probes are not baked by this version"),
-    }
-    for name, (present, why) in parts.items():
-        if present:
-            outcome.modelled.append(name)
-        else:
-            outcome.left_out.append({"what": name, "why": why})
-    skipped = sum(tree.left_out for tree in trees)
-    if skipped:
-        limit = f"{settings.max_points:,} data points" + f" and {settings.max_bytes:,} bytes" * bool(settings.max_bytes)
-        why = f"a world cell may hold {limit}; the neediest voxels were refined"
-        outcome.left_out.append({"what": f"{skipped} voxels", "why": why})
-    outcome.left_out += [{"what": note.what, "why": note.why} for note in snapshot.notes]
-    return outcome
-
-
-def _describe_checks(work: _Work, transports: list[str]) -> list[dict]:
-    """What the caches of all cells were found to be off by, and the noise of data points, by transport."""
-    made = Check.join([work.checks[cell] for cell in sorted(work.checks)], len(work.judge.views))
-    if len(made.paths) < 2:
-        return []
-    (bias, error), noise = made.bias(), made.noise()
-    parts = {"bias": bias, "bias_error": error, "noise": noise}
-    figures = (
-        {key: round(float(np.nan_to_num(part[number], nan=np.inf)), 5) for key, part in parts.items()}
-        for number in range(len(bias))
-    )
-    return [{"what": name, "places": len(made.paths)} | row for name, row in zip(transports, figures, strict=True)]
-
-
-def _file_sizes(cells: list[dict]) -> dict[str, int]:
-    """Bytes on disk by kind."""
-    sizes = dict.fromkeys(("tree", "local", "sun", "sky", "points", "probes"), 0)
-    for entry in cells:
-        for name, file in entry["files"].items():
-            sizes[name] += int(file["bytes"])
-    return sizes
 
 
 def _list(cells) -> str:

@@ -14,6 +14,7 @@ import sys
 import time
 from pathlib import Path
 
+import build_scenes
 import numpy as np
 import pytest
 from command_line import QUICK, Points, call, cells_only, content, ground_points, stored, succeed, yard
@@ -21,6 +22,7 @@ from gi_volumes.bake import job
 from gi_volumes.bake.parallel import CancelledError
 from gi_volumes.bake.scene import prepare
 from gi_volumes.bake.settings import Settings, SettingsError, model
+from gi_volumes.bake.snapshot import Material
 from gi_volumes.tree import container
 from statistics_checks import standard_error
 
@@ -279,6 +281,19 @@ def test_nothing_is_written_once_the_folder_is_closed(row, tmp_path, monkeypatch
     with pytest.raises(CancelledError):
         made[0].write_cell(None, {}, None, None)
     assert content(tmp_path) == before
+
+
+def test_lamps_inside_closed_meshes_are_named(tmp_path):
+    lit = yard()
+    shade = build_scenes.box((12.8, 12.8, 2.8), (13.2, 13.2, 3.2))
+    ground = build_scenes.plane(6.0) + np.array([12, 12, 0])
+    parts = [(ground, Material("white")), (shade, Material("shade"))]
+    dark = build_scenes.snapshot(parts, lit.lights, (0.2, 0.3, 0.5), (0.0, 0.0, 0.0))
+    said = [succeed("bake", stored(tmp_path, made), "-o", tmp_path / "out", *QUICK)["warnings"] for made in (lit, dark)]
+    assert [[text for text in texts if "closed meshes" in text] for texts in said] == [
+        [],
+        ["local: no light arrives at any data point; are all lamps inside closed meshes?"],
+    ]
 
 
 def test_a_black_sky_of_functions_is_judged_as_a_white_one():
