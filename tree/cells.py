@@ -284,11 +284,8 @@ def has_cell(folder: str | os.PathLike, cell: tuple[int, int], bake: str) -> boo
     bool
         False for anything missing, damaged or different, and for an early look at the cell.
     """
-    try:
-        meta = read_cell(folder, cell).meta
-        return meta["bake"] == bake and not meta.get("early", False)
-    except (OSError, FileError):
-        return False
+    meta = _meta(folder, cell)
+    return meta.get("bake") == bake and not meta.get("early", False)
 
 
 def bake_of_cell(folder: str | os.PathLike, cell: tuple[int, int]) -> str | None:
@@ -306,10 +303,15 @@ def bake_of_cell(folder: str | os.PathLike, cell: tuple[int, int]) -> str | None
     str or None
         What identifies the bake; None for a cell that is missing or damaged.
     """
+    return _meta(folder, cell).get("bake")
+
+
+def _meta(folder: str | os.PathLike, cell: tuple[int, int]) -> dict:
+    """Header fields of a cell whose files are all there and undamaged; none of another."""
     try:
-        return read_cell(folder, cell).meta["bake"]
+        return read_cell(folder, cell).meta
     except (OSError, FileError):
-        return None
+        return {}
 
 
 def describe_file(path: Path) -> dict:
