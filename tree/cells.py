@@ -11,6 +11,7 @@ bake, cell and tree that they belong to.
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ import numpy as np
 from . import container, payload, validate
 from .container import FileError
 from .planes import NONE, CellPlanes, empty, planes_defect
-from .topology import NODE, Topology
+from .topology import NODE, Topology, is_terminal, link_blocks
 
 __all__ = [
     "PAYLOADS",
@@ -154,7 +155,7 @@ def write_cell(
     header = {**meta, **common, "files": listed, "data_points": size, "valid_points": int(valid.sum())}
     header |= {"grid_min": list(topology.grid_min), "grid_shape": list(topology.grid_shape)}
     header |= {"levels": topology.levels, "left_out": topology.left_out, "dilated": topology.dilated}
-    nodes = {"mask": topology.nodes["mask"], "link": topology.nodes["link"]}
+    nodes = {"mask": topology.nodes["mask"], "terminal": is_terminal(topology.nodes)}
     sizes[TREE] = container.write(cell_path(folder, cell, TREE), TREE, nodes, header)
     return sizes
 
@@ -204,16 +205,16 @@ def read_tree(path: str | os.PathLike) -> tuple[Topology, dict]:
     try:
         cell, low, shape = (_ints(file.meta[key]) for key in ("cell", "grid_min", "grid_shape"))
         levels, left_out, dilated = _ints([file.meta["levels"], file.meta["left_out"], file.meta.get("dilated", 0)])
-        mask, link = file.arrays["mask"], file.arrays["link"]
-        if (len(cell), len(low), len(shape)) != (2, 3, 3) or mask.ndim != 1 or mask.shape != link.shape:
+        mask, terminal = file.arrays["mask"], file.arrays["terminal"]
+        if (len(cell), len(low), len(shape)) != (2, 3, 3) or mask.ndim != 1 or mask.shape != terminal.shape:
             raise ValueError("arrays or header fields have a wrong length")
-        if (mask.dtype, link.dtype) != (NODE["mask"], NODE["link"]):
-            raise ValueError("mask and link have wrong types")
+        if (mask.dtype, terminal.dtype) != (NODE["mask"], bool):
+            raise ValueError("mask and terminal have wrong types")
+        if not 0 < math.prod(shape) <= len(mask) or (terminal & (mask == 0)).any():
+            raise ValueError("nodes are missing for voxels of the dense grid, or one without children is terminal")
     except (KeyError, TypeError, ValueError) as error:
         raise FileError(path, container.PREFIX_BYTES, f"this is no tree: {error}") from None
-    nodes = np.zeros(len(mask), NODE)
-    nodes["mask"], nodes["link"] = mask, link
-    topology = Topology(cell, low, shape, nodes, levels, left_out, dilated)
+    topology = Topology(cell, low, shape, link_blocks(mask, terminal, math.prod(shape)), levels, left_out, dilated)
     defect = validate.first_defect(topology)
     if defect:
         raise FileError(path, container.PREFIX_BYTES, defect)

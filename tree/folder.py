@@ -26,7 +26,7 @@ __all__ = ["Cell", "assemble", "bake_of_cell", "files", "grid_of", "has_cell", "
 
 WORLD = "world.json"
 WORLD_FORMAT = "gi_volumes world"
-WORLD_VERSION = 1
+WORLD_VERSION = 2
 MAX_WORLD_BYTES = 1 << 28
 """A `world.json` of a million cells; anything longer is not one."""
 FILE_NAME = re.compile(r"cell_(-?\d+)_(-?\d+)\.(tree|points|local|sun|sky)")
@@ -108,7 +108,8 @@ def load_header(folder: str | os.PathLike) -> dict:
     if not isinstance(content, dict) or content.get("format") != WORLD_FORMAT:
         raise FileError(path, 0, "this is not the world.json of a bake")
     if content.get("version") != WORLD_VERSION:
-        raise FileError(path, 0, f"format version {content.get('version')}; this program reads {WORLD_VERSION}")
+        version = f"format version {content.get('version')}; this program reads {WORLD_VERSION}"
+        raise FileError(path, 0, f"{version}: bake again, or use the program that wrote it")
     if content.get("checksum") != _checksum(content) or text != _to_text(content):
         raise FileError(path, 0, "the checksum is wrong: the file is damaged or was changed by hand")
     return content

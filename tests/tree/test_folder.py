@@ -192,10 +192,29 @@ def test_what_a_reader_would_refuse_is_not_written(what, tmp_path):
 def test_a_broken_invariant_behind_right_checksums_is_named_in_words(bake):
     path = cells.cell_path(bake, (0, 0), "tree")
     file = container.read(path)
-    link = file.arrays["link"].copy()
-    link[np.flatnonzero(file.arrays["mask"])[0]] ^= 1
-    container.write(path, "tree", {"mask": file.arrays["mask"], "link": link}, file.meta)
-    with pytest.raises(container.FileError, match=r"node \d+ .*(terminal|block)"):
+    mask, terminal = file.arrays["mask"], file.arrays["terminal"].copy()
+    terminal[np.flatnonzero(mask)[0]] ^= True
+    container.write(path, "tree", {"mask": mask, "terminal": terminal}, file.meta)
+    with pytest.raises(container.FileError, match=r"node array has \d+ nodes, .* need|node \d+ .*(terminal|block)"):
+        cells.read_tree(path)
+
+
+def test_a_terminal_bit_without_children_is_refused(bake):
+    path = cells.cell_path(bake, (0, 0), "tree")
+    file = container.read(path)
+    mask, terminal = file.arrays["mask"], file.arrays["terminal"].copy()
+    terminal[np.flatnonzero(mask == 0)[0]] = True
+    container.write(path, "tree", {"mask": mask, "terminal": terminal}, file.meta)
+    with pytest.raises(container.FileError, match="one without children is terminal"):
+        cells.read_tree(path)
+
+
+@pytest.mark.parametrize("shape", [[1 << 70, 1, 1], [-(1 << 70), 1, 1], [0, 1, 1], [-1, -1, 1], [40, 40, 40]])
+def test_a_grid_that_the_nodes_do_not_fill_is_refused(bake, shape):
+    path = cells.cell_path(bake, (0, 0), "tree")
+    file = container.read(path)
+    container.write(path, "tree", file.arrays, file.meta | {"grid_shape": shape})
+    with pytest.raises(container.FileError, match=r"dense grid"):
         cells.read_tree(path)
 
 

@@ -1,6 +1,7 @@
 """docs/format.md is enough: a reader written from its text alone reads a real bake."""
 
 import json
+import math
 import re
 import struct
 import sys
@@ -18,7 +19,7 @@ import meshes
 
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "format.md").read_text()
 
-# --- from here to the next line, only struct, json, zlib and zstandard ---
+# --- from here to the next line, only struct, json, math, zlib and zstandard ---
 ITEMS = dict(
     zip(
         ["|b1", "|i1", "|u1", "<i2", "<u2", "<i4", "<u4", "<i8", "<u8", "<f2", "<f4", "<f8"],
@@ -57,9 +58,20 @@ def read_container(path):
     return header["kind"], header["meta"], arrays
 
 
+def first_children(meta, arrays):
+    """Index of each node's first child: blocks lie in the order of their parents."""
+    inner, leaf, first = math.prod(meta["grid_shape"]), len(arrays["mask"]), []
+    for mask, terminal in zip(arrays["mask"], arrays["terminal"], strict=True):
+        first.append(leaf if terminal else inner)
+        leaf, inner = (leaf + mask.bit_count(), inner) if terminal else (leaf, inner + mask.bit_count())
+    assert inner == len(arrays["mask"])
+    return first
+
+
 def walk(meta, arrays):
     """Yield (index, level, coordinates) of every voxel."""
     nx, ny, nz = meta["grid_shape"]
+    first = first_children(meta, arrays)
     x0, y0, z0 = meta["grid_min"]
     todo = [
         (x + nx * (y + ny * z), 0, (x0 + x, y0 + y, z0 + z)) for z in range(nz) for y in range(ny) for x in range(nx)
@@ -69,12 +81,12 @@ def walk(meta, arrays):
         yield index, level, place
         if index >= len(arrays["mask"]):
             continue
-        mask, link = arrays["mask"][index], arrays["link"][index]
+        mask = arrays["mask"][index]
         for bit in range(64):
             if mask >> bit & 1:
-                child = (link >> 1) + bin(mask & ((1 << bit) - 1)).count("1")
+                child = first[index] + (mask & ((1 << bit) - 1)).bit_count()
                 step = (bit & 3, bit >> 2 & 3, bit >> 4)
-                assert (child >= len(arrays["mask"])) == bool(link & 1)
+                assert (child >= len(arrays["mask"])) == arrays["terminal"][index]
                 todo.append((child, level + 1, tuple(4 * c + s for c, s in zip(place, step, strict=True))))
 
 
