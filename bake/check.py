@@ -7,11 +7,12 @@ the noise of a data point. It costs about as much as a hundredth of the bake.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from ..tree.outline import Outline
+from ..tree.grid import Grid
 from . import datapoints
 from .gather import Effort, gather
 from .lamps import LUMINANCE
@@ -118,36 +119,48 @@ class Check:
         return off.mean(axis=0), residual.std(axis=0, ddof=1) / np.sqrt(len(off)), scale
 
 
-def check(cached: Scene, scene: Scene, cell: Outline, judge: Judge, effort: Effort) -> Check:
+def check(
+    cached: Scene,
+    scene: Scene,
+    grid: Grid,
+    coords: Sequence[np.ndarray],
+    judge: Judge,
+    effort: Effort,
+    voxels: int = VOXELS,
+) -> Check:
     """Measure some of the voxels that a cell may have, by the cache twice and by paths.
 
     Parameters
     ----------
     cached, scene : Scene
         With the cache and without.
-    cell : Outline
-        The cell.
+    grid : Grid
+        The lattice.
+    coords : sequence of (n, 3) int64 ndarray
+        Voxels that the cell may have, by level.
     judge : Judge
         What is looked at.
     effort : Effort
         As data points are measured.
+    voxels : int
+        How many to look at.
 
     Returns
     -------
     Check
-        Those of `VOXELS` that are not inside walls; the same for any number of threads.
+        Those of them that are not inside walls; the same for any number of threads.
 
     Notes
     -----
     Error: bias and noise are those of one draw of paths; the standard error of the bias says how well it is known.
     """
-    level = np.repeat(np.arange(len(cell.coords)), [len(part) for part in cell.coords]).astype(np.uint8)
-    coords = np.concatenate(cell.coords)
+    level = np.repeat(np.arange(len(coords)), [len(part) for part in coords]).astype(np.uint8)
+    coords = np.concatenate(coords)
     key = datapoints.keys(level, coords)
-    rows = np.argsort(scramble(key, SEEDS[0]), kind="stable")[:VOXELS]
+    rows = np.argsort(scramble(key, SEEDS[0]), kind="stable")[:voxels]
     level, coords, key = level[rows], coords[rows], key[rows]
-    size = np.asarray(cell.grid.voxel_size(level.astype(np.int64)), np.float64)
-    placed = datapoints.place(scene, cell.grid.centers(level, coords), size, key, effort.threads)
+    size = np.asarray(grid.voxel_size(level.astype(np.int64)), np.float64)
+    placed = datapoints.place(scene, grid.centers(level, coords), size, key, effort.threads)
     position, key = np.ascontiguousarray(placed.position[:, placed.valid]), key[placed.valid]
     found = []
     for light, seed in zip((cached, scene, cached), SEEDS, strict=True):

@@ -195,6 +195,8 @@ def _add_bake(commands) -> None:
     command.add_argument("--cells", type=_cells, help="only these world cells: 0,1/3,2")
     text = "write a coarse look at every cell first, within seconds, for those who watch the folder"
     command.add_argument("--early", action="store_true", help=text)
+    text = "keep what is measured in DIR/memory, and measure again only what has changed since"
+    command.add_argument("--incremental", action="store_true", help=text)
     _add_light(command)
 
 
@@ -243,7 +245,8 @@ def _run_bake(options, extract: Extract, progress: Progress) -> dict:
     settings = dataclasses.replace(settings, **own)
     check_target(options.output)
     snapshot = _read_scene(options.scene, extract, progress)
-    outcome = job.bake(snapshot, options.output, settings, options.cells, options.threads, progress, options.early)
+    manner = options.threads, progress, options.early, options.incremental
+    outcome = job.bake(snapshot, options.output, settings, options.cells, *manner)
     return dataclasses.asdict(outcome)
 
 
@@ -340,6 +343,8 @@ def _show_bake(result: dict) -> str:
             f"{item['what']} by the surface cache: {bias} off on average, noise {100 * item['noise']:.1f} % before the "
             f"fit (beside paths, at {item['places']} places)"
         )
+    if result["kept"]:
+        lines.append(f"kept as they were measured before: {result['kept']} data points")
     lines += [f"left out: {item['what']}: {item['why']}" for item in result["left_out"]]
     lines += [f"warning: {text}" for text in result["warnings"]]
     return "\n".join(lines)

@@ -23,8 +23,9 @@ from ..tree.grid import FIRST_SIZE, Grid
 from ..tree.outline import Outline, outline
 from ..tree.planes import of_cell
 from ..tree.topology import Topology
-from . import radiosity, snapshot_file, summary
-from .check import Check, check
+from . import changes, memory, radiosity, snapshot_file, summary
+from .again import Again, remember, settled
+from .check import VOXELS, Check, check
 from .fills import fills
 from .gather import Effort
 from .measured import split
@@ -32,7 +33,7 @@ from .parallel import CancelledError, Room, held, run_jobs
 from .place import Place, check_target
 from .progress import Progress
 from .reference import sun_strength
-from .refine import Target, refine, sketch
+from .refine import Refinement, Target, sketch
 from .scene import Model, Scene, prepare
 from .settings import (
     ERRORS,
@@ -80,6 +81,9 @@ WHITE = np.array([[np.sqrt(4 * np.pi)] * 3] + [[0.0] * 3] * 8)
 STEPS = 1000
 """Units of progress in a cell."""
 
+RECHECKED = VOXELS // 4
+"""Voxels at which the surface cache of a cell that has been baked before is checked."""
+
 
 def bake(
     snapshot: Snapshot,
@@ -89,6 +93,7 @@ def bake(
     threads: int = 0,
     progress: Progress | None = None,
     early: bool = False,
+    incremental: bool = False,
 ) -> Outcome:
     """Bake some or all cells of a scene.
 
@@ -109,6 +114,9 @@ def bake(
     early : bool
         Whether to write a coarse look at every cell first, within seconds, for those who watch the folder; not where
         it would take the place of another bake. What is there in the end is the same.
+    incremental : bool
+        Whether to keep what is measured in files of its own, and to measure again only what has changed since an
+        earlier bake of the folder kept it.
 
     Returns
     -------
@@ -129,7 +137,7 @@ def bake(
     check_target(target)
     progress.stage("Preparing")
     effective, light = model(snapshot, settings)
-    identity = bake_hash(effective, settings, light)
+    identity = bake_hash(effective, settings, light, incremental)
     scene = prepare(effective, light)
     check_triangles(scene.soup.corners)
     levels = LEVELS if settings.error else LEVELS - 1
@@ -137,16 +145,18 @@ def bake(
     occupied = [tuple(int(v) for v in cell) for cell in build.occupied_cells(scene.soup.corners, grid)]
     header = summary.header(snapshot, settings, scene, grid, identity) | {"expected_cells": occupied}
     wanted = _in_view(snapshot, grid, _wanted(cells, occupied))
-    place = Place(target, snapshot, header)
+    place = Place(target, snapshot, header, incremental)
     effort = Effort(settings.samples, settings.bounces, settings.seed, threads)
     goal = Target(settings.error, settings.max_points, settings.dilation, effort, settings.receiver_samples)
     room = Room(TOGETHER)
-    work = _Work(scene, grid, place, settings, _judge(snapshot, settings, scene), goal, room)
+    history = _History(_rules(settings, scene, grid), changes.causes(effective, scene)) if incremental else None
+    work = _Work(scene, grid, place, settings, _judge(snapshot, settings, scene), goal, room, history)
     try:
         if early and place.taken:
             _look_early(work, wanted, progress)
         trees = _bake_cells(work, wanted, progress)
         place.take()
+        _forget(target, occupied)
     finally:
         listed = [entry for entry in place.close() if not entry.get("early")]
     outcome = summary.describe(snapshot, settings, scene, trees)
@@ -157,6 +167,7 @@ def bake(
         )
     made = Check.join([work.checks[cell] for cell in sorted(work.checks)], len(work.judge.views))
     outcome.checked = summary.checked(made, list(header["transports"]))
+    outcome.kept = sum(work.kept.values())
     outcome.warnings += sorted(work.warnings)
     if len(work.arriving) == len(wanted):
         outcome.warnings += summary.dark(list(header["transports"]), list(work.arriving.values()))
@@ -168,7 +179,7 @@ def bake(
     return outcome
 
 
-def bake_hash(snapshot: Snapshot, settings: Settings, light: Model) -> str:
+def bake_hash(snapshot: Snapshot, settings: Settings, light: Model, incremental: bool = False) -> str:
     """Identify everything that a cell's values depend on.
 
     Parameters
@@ -179,6 +190,8 @@ def bake_hash(snapshot: Snapshot, settings: Settings, light: Model) -> str:
         How it is baked; the words for sun and sky count by what they mean.
     light : Model
         What is baked.
+    incremental : bool
+        Whether values may be an earlier bake's.
 
     Returns
     -------
@@ -186,8 +199,23 @@ def bake_hash(snapshot: Snapshot, settings: Settings, light: Model) -> str:
         32 hexadecimal digits.
     """
     words = dataclasses.asdict(settings) | {"sun": light.suns.toward.tolist(), "sky": light.sky}
+    words |= {"incremental": True} if incremental else {}
     text = json.dumps([FORMAT, snapshot_file.digest(snapshot), words, light.suns.diameter.tolist()], sort_keys=True)
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+@dataclass(frozen=True)
+class _History:
+    """What an incremental bake compares: digests of its settings, and of what each transport's light depends on."""
+
+    rules: str
+    causes: dict[str, str]
+
+
+def _rules(settings: Settings, scene: Scene, grid: Grid) -> str:
+    """Digest of all that has to be the same for an earlier bake to be of use."""
+    words = dataclasses.asdict(settings) | {"sun": len(scene.model.suns.toward), "sky": scene.model.sky}
+    return memory.digest(FORMAT, sorted(words.items()), grid, scene.has_local)
 
 
 def _wanted(cells: list[tuple[int, int]] | None, occupied: list[tuple[int, int]]) -> list[tuple[int, int]]:
@@ -218,21 +246,24 @@ class _Work:
     judge: Judge
     target: Target
     room: Room
+    history: _History | None
     warnings: list[str] = field(default_factory=list)
     shared: list[Scene] = field(default_factory=list)
     arriving: dict[tuple[int, int], set[str]] = field(default_factory=dict)
     checks: dict[tuple[int, int], Check] = field(default_factory=dict)
+    kept: dict[tuple[int, int], int] = field(default_factory=dict)
     lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def light_in(self, cell: Outline, show: Callable[[float], bool]) -> Scene:
-        """The scene, with a surface cache if there is to be one, and it is worth the paths that it takes: of a scene no
-        larger than a cell the same for all."""
-        expected = self.settings.samples * sum(len(coords) for coords in cell.coords)
-        if self.settings.method != "cache" or expected < WORTH:
-            return self.scene
+    def light_in(self, voxels: _Voxels, show: Callable[[float], bool]) -> Scene:
+        """The scene, with a surface cache if there is to be one, and it is worth the paths that it takes."""
+        expected = self.settings.samples * sum(len(coords) for coords in voxels.coords)
+        return self.scene if self.settings.method != "cache" or expected < WORTH else self.cached(voxels, show)
+
+    def cached(self, voxels: _Voxels, show: Callable[[float], bool]) -> Scene:
+        """The scene with a surface cache: of a scene no larger than a cell the same for all."""
         bounds, effort = self.scene.soup.bounds, self.target.effort
         if np.ptp(bounds[:, :2], axis=0).max() > self.grid.cell_size:
-            dense = np.stack([cell.dense.low, cell.dense.low + cell.dense.shape]) * self.grid.first_size
+            dense = voxels.dense * self.grid.first_size
             return radiosity.around(self.scene, self.grid, dense, effort, lambda share: show(CACHED * share))
         with held(self.lock):
             if not self.shared:
@@ -241,15 +272,38 @@ class _Work:
                 self.shared.append(found)
             return self.shared[0]
 
-    def trusted(self, cached: Scene, cell: Outline) -> Scene:
+    def trusted(self, cached: Scene, voxels: _Voxels, count: int = VOXELS) -> Scene:
         """The scene with the cache, or without where that is off by more than the bake's error."""
         if cached is self.scene:
             return cached
-        made = self.checks[cell.cell] = check(cached, self.scene, cell, self.judge, self.target.effort)
+        made = check(cached, self.scene, self.grid, voxels.coords, self.judge, self.target.effort, count)
+        self.checks[voxels.cell] = made
         if not made.fails(self.settings.error or ERRORS["preview"]):
             return cached
-        self.warnings.append(f"cell {_list([cell.cell])}: the surface cache is too far off, so paths went to their end")
+        self.warnings.append(
+            f"cell {_list([voxels.cell])}: the surface cache is too far off, so paths went to their end"
+        )
         return self.scene
+
+
+@dataclass(frozen=True, eq=False)
+class _Voxels:
+    """Where light in a cell is measured: voxels by level, and the box of first-level ones."""
+
+    cell: tuple[int, int]
+    coords: list[np.ndarray]
+    dense: np.ndarray
+
+    @classmethod
+    def of_outline(cls, found: Outline) -> _Voxels:
+        return cls(found.cell, list(found.coords), np.stack([found.dense.low, found.dense.low + found.dense.shape]))
+
+    @classmethod
+    def of_tree(cls, tree: Topology) -> _Voxels:
+        level, coords = tree.voxels()
+        low = np.array(tree.grid_min)
+        parts = [coords[level == own] for own in range(tree.levels)]
+        return cls(tree.cell, parts, np.stack([low, low + tree.grid_shape]))
 
 
 def _judge(snapshot: Snapshot, settings: Settings, scene: Scene) -> Judge:
@@ -329,28 +383,80 @@ def _bake_cells(work: _Work, cells: list[tuple[int, int]], progress: Progress) -
 def _bake_cell(work: _Work, cell: tuple[int, int], show: Callable[[float], bool]) -> Topology:
     """Grow the tree of one cell, measure and fit its light, write its files; again with fewer data points where it
     takes more bytes than it may."""
+    if work.history:
+        known = memory.load(work.place.target, cell, work.grid, work.history.rules)
+        tree = known and _bake_again(work, known, show)
+        if tree:
+            return tree
     found = outline(work.scene.soup.corners, work.grid, cell, by_light=work.target.error > 0)
     _check_cap(found, work.target.max_points)
     with work.room.hold(sum(len(coords) for coords in found.coords)):
         return _fill_cell(work, cell, found, show)
 
 
+def _bake_again(work: _Work, known: memory.Memory, show: Callable[[float], bool]) -> Topology | None:
+    """The same for a cell that has been baked before; None where that is of no help."""
+    cell, voxels, now = known.tree.cell, _Voxels.of_tree(known.tree), work.history.causes
+    scene = work.trusted(work.cached(voxels, show), voxels, RECHECKED) if known.cached else work.scene
+    if known.cached and scene is work.scene:
+        return None
+    effort, samples = work.target.effort, work.target.samples
+    past = changes.compare(known, scene, work.grid, now, effort, samples)
+    if past is None:
+        return None
+    if not past.changed and work.place.keep_cell(cell, known.content):
+        work.kept[cell] = past.kept
+        return known.tree
+    if not past.decide:
+        refined = settled(past, work.grid)
+        made = dataclasses.replace(past.memory, pilot=past.pilot, causes=now)
+    else:
+        found = outline(work.scene.soup.corners, work.grid, cell, by_light=work.target.error > 0)
+        again = Again(scene, found, work.judge, work.target, show, past)
+        with work.room.hold(sum(len(coords) for coords in found.coords)):
+            refined = again.run()
+        made = remember(again, work.judge, now, known.rules, past)
+    limit = work.settings.max_bytes
+    size = _write(work, cell, refined, limit=limit)
+    if limit and size > limit:
+        return None
+    work.kept[cell] = past.kept
+    _keep(work, made)
+    return refined.tree
+
+
 def _fill_cell(work: _Work, cell: tuple[int, int], found: Outline, show: Callable[[float], bool]) -> Topology:
     """The same for a cell whose outline is known."""
-    scene, target, limit = work.trusted(work.light_in(found, show), found), work.target, work.settings.max_bytes
+    voxels, target, limit = _Voxels.of_outline(found), work.target, work.settings.max_bytes
+    scene = work.trusted(work.light_in(voxels, show), voxels)
     if found.cell in work.checks:
         whole, show = show, lambda share: whole(CACHED + (1 - CACHED) * share)
     for attempt in range(BUDGET_TRIES):
         last = attempt == BUDGET_TRIES - 1
-        refined = refine(scene, found, work.judge, target, _part_of(show, attempt) if limit else show)
-        size = _write(work, cell, refined, limit=0 if last else limit)
+        made = Refinement(scene, found, work.judge, target, _part_of(show, attempt) if limit else show)
+        size = _write(work, cell, made.run(), limit=0 if last else limit)
         if last or not limit or size <= limit:
             break
-        points = int(refined.tree.size * BUDGET_MARGIN * limit / size)
+        points = int(made.state.tree.size * BUDGET_MARGIN * limit / size)
         target = dataclasses.replace(target, max_points=max(points, int(np.prod(found.dense.shape)) + 1))
     if limit and size > limit:
         work.warnings.append(f"cell {_list([cell])} takes {size:,} bytes, {size - limit:,} more than --max-bytes")
-    return refined.tree
+    if work.history:
+        _keep(work, remember(made, work.judge, work.history.causes, work.history.rules, None))
+    return made.state.tree
+
+
+def _keep(work: _Work, made: memory.Memory) -> None:
+    """Write down what the next bake may use of a cell whose files are there."""
+    found = folder.read_cell(work.place.target, made.tree.cell)
+    bounds = {name: payload.relative_error for name, payload in found.payloads.items()}
+    memory.save(dataclasses.replace(made, bounds=bounds, content=folder.digest_of_cell(found)), work.place.target)
+
+
+def _forget(target: Path, occupied: list[tuple[int, int]]) -> None:
+    """Remove what is known of cells that the scene no longer has."""
+    for path in set(memory.files(target)) - {memory.memory_path(target, cell) for cell in occupied}:
+        path.unlink(missing_ok=True)
 
 
 def _check_cap(found: Outline, max_points: int) -> None:

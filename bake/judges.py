@@ -25,7 +25,7 @@ GAP = 1 / 256
 """How close before walls some of them lie [finest voxels]: 0.5 mm at 0.125 m."""
 
 
-def around(scene: Scene, grid: Grid, tree: Topology, threads: int = 0) -> Receivers:
+def around(scene: Scene, grid: Grid, tree: Topology, threads: int = 0, only: np.ndarray | None = None) -> Receivers:
     """Spread judges over all surfaces that a cell's data points may light.
 
     Parameters
@@ -38,6 +38,8 @@ def around(scene: Scene, grid: Grid, tree: Topology, threads: int = 0) -> Receiv
         The cell.
     threads : int
         Worker threads; 0 uses every core.
+    only : (size,) bool ndarray, optional
+        Voxels that matter; all of them when left out.
 
     Returns
     -------
@@ -49,7 +51,9 @@ def around(scene: Scene, grid: Grid, tree: Topology, threads: int = 0) -> Receiv
     parts = []
     for level in np.unique(voxel_level):
         size = float(grid.voxel_size(level))
-        of = coords[voxel_level == level]
+        of = coords[(voxel_level == level) & (True if only is None else only)]
+        if not len(of):
+            continue
         low, high = (of.min(axis=0) - 0.5) * size, (of.max(axis=0) + 1.5) * size
         spacing = DENSER * receivers.spacing(int(level), size)
         lit, near = _lit_by(grid, voxel_level, coords, int(level)), receivers.touching(neighbours(of), size)

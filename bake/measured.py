@@ -6,6 +6,7 @@ every voxel, in the order of the tree. A voxel's measure depends on the voxel al
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from ..tree.cells import OFFSET_STEPS
 from ..tree.grid import Grid
+from ..tree.region import finder
 from ..tree.topology import Topology
 from . import datapoints
 from .gather import Effort, Gathered, gather
@@ -35,6 +37,41 @@ class Measured:
     offset: np.ndarray
     valid: np.ndarray
     light: np.ndarray
+
+
+def take(measured: Measured, rows: np.ndarray) -> Measured:
+    """Choose some data points.
+
+    Parameters
+    ----------
+    measured : Measured
+        Data points.
+    rows : (m,) int64 or (n,) bool ndarray
+        Which.
+
+    Returns
+    -------
+    Measured
+        Copies.
+    """
+    return Measured(*(getattr(measured, field.name)[rows] for field in dataclasses.fields(Measured)))
+
+
+def join(one: Measured, other: Measured) -> Measured:
+    """Put data points together.
+
+    Parameters
+    ----------
+    one, other : Measured
+        Data points of different voxels.
+
+    Returns
+    -------
+    Measured
+        All of them.
+    """
+    names = [field.name for field in dataclasses.fields(Measured)]
+    return Measured(*(np.concatenate([getattr(part, name) for part in (one, other)]) for name in names))
 
 
 def measure(
@@ -73,7 +110,7 @@ def measure(
         `progress` returned False.
     """
     level, coords = tree.voxels()
-    row = _rows_in(known, tree, level, coords)
+    row = _rows_in(known, level, coords)
     new = np.flatnonzero(row < 0)
     fresh = _trace(scene, grid, level[new], coords[new], effort, progress)
     out = Measured(level, coords, *(np.empty((tree.size, *part.shape[1:]), part.dtype) for part in fresh))
@@ -84,10 +121,10 @@ def measure(
     return out
 
 
-def move(
+def moved_light(
     scene: Scene, grid: Grid, measured: Measured, rows: np.ndarray, offset: np.ndarray, effort: Effort
-) -> Measured:
-    """Measure some data points elsewhere in their voxels.
+) -> np.ndarray:
+    """Measure light elsewhere in some voxels.
 
     Parameters
     ----------
@@ -100,23 +137,68 @@ def move(
     rows : (m,) int64 ndarray
         Which data points.
     offset : (m, 3) int8 ndarray
-        Where to, in free space: data point minus voxel centre in steps of the voxel size / 254.
+        Where, in free space: data point minus voxel centre in steps of the voxel size / 254.
     effort : Effort
         As they were measured before.
+
+    Returns
+    -------
+    (m, functions, 9, 3) float32 ndarray
+        Irradiance harmonics there.
+    """
+    level, coords = measured.level[rows], measured.coords[rows]
+    if not (len(rows) and functions(scene)):
+        return np.zeros((len(rows), functions(scene), 9, 3), np.float32)
+    position = _columns(positions(grid, level, coords, offset))
+    return stack(scene, gather(scene, HarmonicsSensor(), position, datapoints.keys(level, coords), effort))
+
+
+def move(measured: Measured, rows: np.ndarray, offset: np.ndarray, light: np.ndarray) -> Measured:
+    """Put some data points elsewhere in their voxels.
+
+    Parameters
+    ----------
+    measured : Measured
+        A cell.
+    rows : (m,) int64 ndarray
+        Which data points.
+    offset : (m, 3) int8 ndarray
+        Where to.
+    light : (m, functions, 9, 3) float32 ndarray
+        What was measured there.
 
     Returns
     -------
     Measured
         The cell with these data points moved, and valid.
     """
-    level, coords = measured.level[rows], measured.coords[rows]
-    size = np.asarray(grid.voxel_size(level.astype(np.int64)), np.float64)[:, None]
-    position = grid.centers(level, coords) + offset.astype(np.float64) * size / OFFSET_STEPS
-    found = gather(scene, HarmonicsSensor(), _columns(position), datapoints.keys(level, coords), effort)
     parts = [measured.offset.copy(), measured.valid.copy(), measured.light.copy()]
-    for part, new in zip(parts, (offset, True, stack(scene, found)), strict=True):
+    for part, new in zip(parts, (offset, True, light), strict=True):
         part[rows] = new
     return Measured(measured.level, measured.coords, *parts)
+
+
+def positions(grid: Grid, level: np.ndarray, coords: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """Say where data points are.
+
+    Parameters
+    ----------
+    grid : Grid
+        The lattice.
+    level : (n,) uint8 ndarray
+        Levels of voxels.
+    coords : (n, 3) int64 ndarray
+        Their global coordinates.
+    offset : (n, 3) int8 ndarray
+        Data point minus voxel centre in steps of the voxel size / 254.
+
+    Returns
+    -------
+    (n, 3) float64 ndarray
+        Relative to the scene's origin [m].
+    """
+    size = np.asarray(grid.voxel_size(level.astype(np.int64)), np.float64)[:, None]
+    return grid.centers(level, coords) + offset.astype(np.float64) * size / OFFSET_STEPS
 
 
 def _columns(position: np.ndarray) -> np.ndarray:
@@ -195,19 +277,11 @@ def _trace(scene: Scene, grid: Grid, level: np.ndarray, coords: np.ndarray, effo
     return placed.offset, placed.valid, light
 
 
-def _rows_in(known: Measured | None, tree: Topology, level: np.ndarray, coords: np.ndarray) -> np.ndarray:
+def _rows_in(known: Measured | None, level: np.ndarray, coords: np.ndarray) -> np.ndarray:
     """Row of each voxel in what is known, -1 for those that are new."""
-    if known is None:
-        return np.full(len(level), -1)
-    low, shape = np.array(tree.grid_min), np.array(tree.grid_shape)
-
-    def keys(level: np.ndarray, coords: np.ndarray) -> np.ndarray:
-        scale = 4 ** level.astype(np.int64)[:, None]
-        x, y, z = (coords - low * scale).T
-        nx, ny = (shape[:2] * scale).T
-        return (x + nx * (y + ny * z)) * 8 + level
-
-    there, here = keys(known.level, known.coords), keys(level, coords)
-    order = np.argsort(there)
-    place = np.minimum(np.searchsorted(there[order], here), len(there) - 1)
-    return np.where(there[order][place] == here, order[place], -1)
+    out = np.full(len(level), -1)
+    for own in np.unique(level) if known is not None else ():
+        there, here = np.flatnonzero(known.level == own), np.flatnonzero(level == own)
+        row = finder(known.coords[there])(coords[here])
+        out[here[row >= 0]] = there[row[row >= 0]]
+    return out

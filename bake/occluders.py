@@ -74,6 +74,7 @@ def fit(
     receivers: Receivers,
     threads: int = 0,
     progress: Callable[[int], bool] | None = None,
+    only: np.ndarray | None = None,
 ) -> Occluders:
     """Fit planes to what receivers see.
 
@@ -89,6 +90,8 @@ def fit(
         Worker threads; 0 uses every core.
     progress : callable, optional
         As in `parallel.run_tiles`, counting receivers whose rays are traced.
+    only : (n,) bool ndarray, optional
+        Data points that need planes; all of them when left out.
 
     Returns
     -------
@@ -106,11 +109,16 @@ def fit(
     Source: half-spaces as the conservative visibility of a sample are ours; row 10 of the talk has the cosine alone.
     """
     pairs = look(scene, data, receivers, threads, progress)
-    return choose(scene, data, receivers, pairs, threads)
+    return choose(scene, data, receivers, pairs, threads, only)
 
 
 def choose(
-    scene: Scene, data: interpolate.DataPoints, receivers: Receivers, pairs: Pairs, threads: int = 0
+    scene: Scene,
+    data: interpolate.DataPoints,
+    receivers: Receivers,
+    pairs: Pairs,
+    threads: int = 0,
+    only: np.ndarray | None = None,
 ) -> Occluders:
     """Fit planes to pairs that are known.
 
@@ -126,13 +134,15 @@ def choose(
         From `sight.look`.
     threads : int
         Worker threads; 0 uses every core.
+    only : (n,) bool ndarray, optional
+        As in `fit`.
 
     Returns
     -------
     Occluders
         As from `fit`.
     """
-    task = _Task(scene, data, receivers, pairs)
+    task = _Task(scene, data, receivers, pairs, only)
     return task.result(task.solve(threads))
 
 
@@ -147,25 +157,19 @@ class _Slots:
 class _Task:
     """Everything that the choice reads: pairs and their worth, candidates, widths."""
 
-    def __init__(self, scene: Scene, data: interpolate.DataPoints, receivers: Receivers, pairs: Pairs) -> None:
-        self.pairs, self.data, self.place = pairs, data, receivers.position
-        self.weight, self.visible = pairs.weight, pairs.visible
-        self.lit = np.bincount(pairs.receiver, self.weight * self.visible, len(self.place))
+    def __init__(self, scene: Scene, data: interpolate.DataPoints, receivers: Receivers, pairs: Pairs, only) -> None:
+        self.data, self.place = data, receivers.position
+        self.lit = np.bincount(pairs.receiver, pairs.weight * pairs.visible, len(self.place))
         self.own = _within(data.boxes, self.place)
-        self.value = self._values(receivers.area.astype(np.float64))
+        chosen = slice(None) if only is None else only[pairs.point]
+        self.value = _values(pairs, receivers.area.astype(np.float64))[chosen]
+        self.pairs = pairs = pairs.take(chosen)
+        self.weight, self.visible = pairs.weight, pairs.visible
         finest = float(data.grid.voxel_size(data.grid.levels - 1))
         self.candidates = blockers.find(scene, pairs, np.abs(self.value), data.position, finest)
         self.falloff = _falloff(finest, data.grid.cell_size)
         self.first = np.searchsorted(pairs.point, np.arange(len(data.valid) + 1))
         self.first_candidate = np.searchsorted(self.candidates.point, np.arange(len(data.valid) + 1))
-
-    def _values(self, area: np.ndarray) -> np.ndarray:
-        """(m,) what hiding each pair gains: its part of the receiver's weight, negative where it is visible."""
-        total = np.bincount(self.pairs.receiver, self.weight, len(self.place))
-        part = (area / np.maximum(total, ENOUGH))[self.pairs.receiver]
-        part *= self.weight
-        part[self.visible] *= -LOSS
-        return part
 
     def solve(self, threads: int) -> _Slots:
         """Choose planes for all data points, then again for those that left receivers without light."""
@@ -249,6 +253,15 @@ class _Task:
         whole = self.weight.astype(np.float64)
         kept = [float(left[of].sum() / max(whole[of].sum(), 1e-30)) for of in (self.visible, ~self.visible)]
         return Occluders(planes, table, self.lit <= FAINT, *kept)
+
+
+def _values(pairs: Pairs, area: np.ndarray) -> np.ndarray:
+    """(m,) what hiding each pair gains: its part of the receiver's weight, negative where it is visible."""
+    total = np.bincount(pairs.receiver, pairs.weight, len(area))
+    part = (area / np.maximum(total, ENOUGH))[pairs.receiver]
+    part *= pairs.weight
+    part[pairs.visible] *= -LOSS
+    return part
 
 
 def _falloff(finest: float, cell: float) -> Falloff:

@@ -95,6 +95,8 @@ class Place:
         The scene, stored beside the cells.
     header : dict
         For `folder.assemble`.
+    patient : bool
+        Whether another bake's cells stay, unlisted, until this one ends: `keep_cell` may take them over.
 
     Attributes
     ----------
@@ -111,8 +113,8 @@ class Place:
         The folder cannot be written; it is as it was before.
     """
 
-    def __init__(self, target: Path, snapshot: Snapshot, header: dict) -> None:
-        self.target, self.identity, self.taken = target, header["bake"], False
+    def __init__(self, target: Path, snapshot: Snapshot, header: dict, patient: bool = False) -> None:
+        self.target, self.identity, self.taken, self._patient = target, header["bake"], False, patient
         self._snapshot, self._header = snapshot, header
         self._staging: list[Path] = []
         self._lock, self._early, self._closed = threading.RLock(), set(), False
@@ -143,8 +145,8 @@ class Place:
             cells = self.list_cells()
             self.taken = True
             (staging / SNAPSHOT_NAME).replace(self.target / SNAPSHOT_NAME)
-        listed = {file["name"] for entry in cells for file in entry["files"].values()}
-        _remove_other_bakes(self.target, self.identity, listed)
+        if not self._patient:
+            self._remove_others(cells)
 
     def close(self) -> list[dict]:
         """List the cells that are there, and leave nothing else; no thread can write any more.
@@ -163,7 +165,10 @@ class Place:
             self._closed = True
             for staging in self._staging:
                 shutil.rmtree(staging, ignore_errors=True)
-            return self.list_cells() if self.taken else []
+            cells = self.list_cells() if self.taken else []
+            if self.taken and self._patient:
+                self._remove_others(cells)
+            return cells
 
     def write_cell(
         self,
@@ -213,17 +218,41 @@ class Place:
             size = sum(path.stat().st_size for path in staging.iterdir())
             if limit and size > limit:
                 return size
-            with self._lock:
-                if self._closed:
-                    raise CancelledError
-                self.take()
-                if tree.cell in self._early:
-                    folder.cell_path(self.target, tree.cell, folder.TREE).unlink(missing_ok=True)
-                for path in sorted(staging.iterdir(), key=lambda path: path.suffix == ".tree"):
-                    path.replace(self.target / path.name)
-                if tree.cell in self._early:
-                    self.list_cells()
+            self._put(staging, tree.cell)
         return size
+
+    def keep_cell(self, cell: tuple[int, int], content: str) -> bool:
+        """Take over a cell of another bake as it is.
+
+        Parameters
+        ----------
+        cell : (2,) int
+            World cell (i, j).
+        content : str
+            What its files have to hold, as `folder.digest_of_cell` says.
+
+        Returns
+        -------
+        bool
+            Whether its files are there, whole, and hold that.
+
+        Raises
+        ------
+        OSError
+            A file cannot be written.
+        CancelledError
+            The folder is closed.
+        """
+        try:
+            found = folder.read_cell(self.target, cell)
+        except (OSError, container.FileError):
+            return False
+        if folder.digest_of_cell(found) != content:
+            return False
+        with self._stage() as staging:
+            folder.copy_cell(self.target, staging, cell, self.identity)
+            self._put(staging, cell)
+        return True
 
     def list_cells(self) -> list[dict]:
         """List the cells that are there in `world.json`.
@@ -241,6 +270,24 @@ class Place:
         cells = folder.assemble(self.target, self._header)["cells"]
         self._early = {tuple(entry["cell"]) for entry in cells if entry.get("early")}
         return cells
+
+    def _put(self, staging: Path, cell: tuple[int, int]) -> None:
+        """Move a cell's files to where they belong."""
+        with self._lock:
+            if self._closed:
+                raise CancelledError
+            self.take()
+            if cell in self._early:
+                folder.cell_path(self.target, cell, folder.TREE).unlink(missing_ok=True)
+            for path in sorted(staging.iterdir(), key=lambda path: path.suffix == ".tree"):
+                path.replace(self.target / path.name)
+            if cell in self._early:
+                self.list_cells()
+
+    def _remove_others(self, cells: list[dict]) -> None:
+        """Remove the files of cells that are not this bake's."""
+        listed = {file["name"] for entry in cells for file in entry["files"].values()}
+        _remove_other_bakes(self.target, self.identity, listed)
 
     @contextlib.contextmanager
     def _stage(self) -> Iterator[Path]:

@@ -26,10 +26,11 @@ from ..tree.topology import Topology
 from . import judges, occluders, parallel, receivers
 from .datapoints import FARTHEST_STEP
 from .gather import Effort
-from .measured import measure, move
+from .measured import Measured, measure, move, moved_light
+from .memory import Look, Moved
 from .receivers import Receivers
 from .scene import Scene
-from .survey import Judge, State, confidence, squared_errors, trace
+from .survey import Judge, Seen, State, confidence, squared_errors, trace
 
 FEWEST = 2
 """Receivers without which a voxel is not judged."""
@@ -111,7 +112,7 @@ def refine(
     -----
     Source: row 6 of the talk subdivides where there is geometry; by error as Unreal's and Activision's volumes do.
     """
-    return _Refinement(scene, outline, judge, target, progress).run()
+    return Refinement(scene, outline, judge, target, progress).run()
 
 
 def sketch(scene: Scene, outline: Outline, judge: Judge, target: Target) -> State:
@@ -133,14 +134,39 @@ def sketch(scene: Scene, outline: Outline, judge: Judge, target: Target) -> Stat
     State
         The same for any number of threads.
     """
-    made = _Refinement(scene, outline, judge, target, None)
-    made.grow()
-    made.look(len(outline.coords) - 1)
+    made = Refinement(scene, outline, judge, target, None)
+    made._grow()
+    made._look(len(outline.coords) - 1)
     return made.state
 
 
-class _Refinement:
-    """One cell on its way: what has been decided, by level, and what has been measured."""
+class Refinement:
+    """One cell on its way: what has been decided, by level, and what has been measured.
+
+    Parameters
+    ----------
+    scene : Scene
+        What light travels through.
+    outline : Outline
+        What the tree could be.
+    judge : Judge
+        What the error is measured in.
+    target : Target
+        When to stop.
+    progress : callable or None
+        As in `refine`.
+
+    Attributes
+    ----------
+    looks : list of Look
+        Receivers of each level, those that finer ones have replaced too.
+    current : (n,) int64 ndarray
+        Rows of all looks that the state has.
+    unmoved : Measured
+        Data points before some were moved into cracks.
+    moved : Moved
+        Those.
+    """
 
     def __init__(self, scene: Scene, outline: Outline, judge: Judge, target: Target, progress):
         self.scene, self.outline, self.judge, self.target = scene, outline, judge, target
@@ -150,115 +176,177 @@ class _Refinement:
             first = GEOMETRY * FINER**level * (1.0 + outline.need[level])
             self.need[level] = np.where(outline.need[level] > 0, first, 0.0)
         self.asked = [np.zeros((0, 3), np.int64)] * self.grid.levels
+        self.looks: list[Look] = []
+        self.current = np.zeros(0, np.int64)
         self.state: State | None = None
         self.judged: tuple | None = None
+        self.unmoved: Measured | None = None
+        self.moved: Moved | None = None
 
     def run(self) -> State:
-        """Level by level, coarse to fine."""
+        """Go level by level, coarse to fine.
+
+        Returns
+        -------
+        State
+            As `refine` returns it.
+        """
         for level in range(self.grid.levels):
-            self.grow()
-            self.look(level)
-            self.asked[level] = self.unlit(level)
+            self._grow()
+            self._look(level)
+            self.asked[level] = self._unlit(level)
             if len(self.asked[level]):
-                self.grow()
-                self.hide(self.state.seen.at)
+                self._grow()
+                self._hide(self.state.seen.at)
             if level == self.grid.levels - 1:
                 break
             if self.target.error:
-                self.need[level] = np.maximum(self.need[level], self.wanting(level))
+                self.need[level] = np.maximum(self.need[level], self._wanting(level))
             if not (self.need[level] > 0).any():
                 break
-        self.fill_cracks()
-        self.hide(judges.around(self.scene, self.grid, self.state.tree, self.target.effort.threads))
+        self.unmoved = self.state.measured
+        self._take_moved(self._fill_cracks())
+        self._hide_finally()
         return self.state
 
-    def grow(self) -> None:
+    def _grow(self) -> None:
         """The tree of what is needed so far, measured."""
-        target, known = self.target, self.state and self.state.measured
+        target = self.target
         tree = build.fit(self.outline, self.need, target.dilation, target.max_points, self.asked)
-        measured = measure(self.scene, self.grid, tree, target.effort, known, self.show())
+        measured = measure(self.scene, self.grid, tree, target.effort, self._known(), self._show())
         data = interpolate.join(self.grid, [tree], measured.offset, measured.valid)
         self.state = State(tree, measured, data, self.state and self.state.seen)
 
-    def look(self, level: int) -> None:
-        """Receivers for every level up to one; those of voxels that were subdivided are replaced by denser ones."""
-        tree, size, effort = self.state.tree, float(self.grid.voxel_size(level)), self.target.effort
-        inside = _voxels_of(self.grid, tree, level)
-        low = np.array(tree.grid_min) * self.grid.first_size
-        high = low + np.array(tree.grid_shape) * self.grid.first_size
-        spacing = receivers.spacing(level, size)
-        of_level, coords = tree.voxels()
-        near = receivers.touching(coords[of_level == level], size)
-        at = receivers.spread(self.scene, low, high, spacing, inside, effort.threads, touches=near)
-        seen = trace(self.scene, at, dataclasses.replace(effort, samples=self.target.samples), self.show())
-        if self.state.seen is not None:
-            seen = self.state.seen.take(~inside(self.state.seen.at.position)).plus(seen)
-        self.state = dataclasses.replace(self.state, seen=seen)
-        self.hide(seen.at)
+    def _known(self) -> Measured | None:
+        """Data points that need not be measured any more."""
+        return self.state and self.state.measured
 
-    def hide(self, at: Receivers) -> None:
+    def _look(self, level: int) -> None:
+        """Receivers for every level up to one; those of voxels that were subdivided are replaced by denser ones."""
+        of_level, coords = self.state.tree.voxels()
+        self.looks.append(Look(coords[of_level == level], self._found(level)))
+        seen, first = self.looks[-1].seen, sum(len(look.seen.at.key) for look in self.looks[:-1])
+        new = first + np.arange(len(seen.at.key))
+        if self.state.seen is not None:
+            kept = ~_voxels_of(self.grid, self.state.tree, level)(self.state.seen.at.position)
+            seen, new = self.state.seen.take(kept).plus(seen), np.concatenate([self.current[kept], new])
+        self.state, self.current = dataclasses.replace(self.state, seen=seen), new
+        self._hide(seen.at)
+
+    def _found(self, level: int) -> Seen:
+        """Receivers on all surfaces in the tree's voxels of a level, with their light."""
+        of_level, coords = self.state.tree.voxels()
+        return self._seen_in(level, coords[of_level == level])
+
+    def _seen_in(self, level: int, coords: np.ndarray) -> Seen:
+        """Receivers in some of the tree's voxels of a level, traced."""
+        size, effort = float(self.grid.voxel_size(level)), self.target.effort
+        low, high = (coords.min(axis=0) * size, (coords.max(axis=0) + 1) * size) if len(coords) else np.zeros((2, 3))
+        spacing, has = receivers.spacing(level, size), receivers.among(coords)
+        near = receivers.touching(coords, size)
+
+        def inside(position: np.ndarray) -> np.ndarray:
+            return has(np.floor(position / size).astype(np.int64))
+
+        at = receivers.spread(self.scene, low, high, spacing, inside, effort.threads, touches=near)
+        return trace(self.scene, at, dataclasses.replace(effort, samples=self.target.samples), self._show())
+
+    def _near(self, at: Receivers) -> np.ndarray:
+        """Rows of the receivers that decisions of this level depend on."""
+        return np.arange(len(at.key))
+
+    def _hide(self, at: Receivers) -> None:
         """Planes for all data points, as some receivers see them: those with light on the way, as they are there; in
         the end denser ones on all surfaces that the cell may light, those of other cells too."""
         parallel.check()
+        at = at.take(self._near(at))
         hidden = occluders.fit(self.scene, self.state.data, at, self.target.effort.threads)
-        data = dataclasses.replace(self.state.data, planes=hidden.planes, plane=hidden.plane)
-        self.state = dataclasses.replace(self.state, data=data)
+        self._set_planes(hidden.planes, hidden.plane)
 
-    def errors(self) -> tuple[np.ndarray, np.ndarray]:
-        """(n,) relative squared errors at the receivers, and (n,) what part of that may be noise; once for each state,
-        as they take a fit."""
+    def _hide_finally(self) -> None:
+        """Planes for all data points, as dense receivers on all surfaces see them that the cell may light, those of
+        other cells too."""
+        parallel.check()
+        at = judges.around(self.scene, self.grid, self.state.tree, self.target.effort.threads)
+        hidden = occluders.fit(self.scene, self.state.data, at, self.target.effort.threads)
+        self._set_planes(hidden.planes, hidden.plane)
+
+    def _set_planes(self, planes: np.ndarray, plane: np.ndarray) -> None:
+        """Give the data points their planes."""
+        self.state = dataclasses.replace(
+            self.state, data=dataclasses.replace(self.state.data, planes=planes, plane=plane)
+        )
+
+    def _errors(self) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) relative squared errors at the receivers, and (n,) what part of that may be noise, 0 where no decision
+        depends on it; once for each state, as they take a fit."""
         if self.judged is None or self.judged[0] is not self.state:
-            self.judged = self.state, squared_errors(self.state, self.judge, self.target.effort.threads)
+            rows = self._near(self.state.seen.at)
+            state = dataclasses.replace(self.state, seen=self.state.seen.take(rows))
+            found = np.zeros((2, len(self.state.seen.at.key)), np.float32)
+            found[:, rows] = squared_errors(state, self.judge, self.target.effort.threads)
+            self.judged = self.state, found
         return self.judged[1]
 
-    def wanting(self, level: int) -> np.ndarray:
+    def _wanting(self, level: int) -> np.ndarray:
         """What subdivision of each solid voxel of a level buys for each data point; 0 where it is good enough."""
         coords, at = self.outline.coords[level], self.state.seen.at
         voxel = np.floor(at.position / float(self.grid.voxel_size(level))).astype(np.int64)
         row = finder(coords)(voxel)
         inside, row = np.flatnonzero(row >= 0), row[row >= 0]
         area, count = at.area[inside], len(coords)
-        squared, noise = (np.bincount(row, values[inside] * area, count) for values in self.errors())
+        squared, noise = (np.bincount(row, values[inside] * area, count) for values in self._errors())
         number = np.maximum(np.bincount(row, minlength=count), 1)
         allowed = self.target.error**2 * np.bincount(row, area, count) + SURE * noise * np.sqrt(2 / number)
         poor = (squared > allowed) & (number >= FEWEST)
         return np.where(poor, squared / np.maximum(self.outline.cost(level), 1), 0.0)
 
-    def unlit(self, level: int) -> np.ndarray:
+    def _unlit(self, level: int) -> np.ndarray:
         """(m, 3) missing voxels in front of receivers that hardly any data point lights, and that are wrong for it:
         a thin surface has two sides, and the data point of its voxel is on one of them."""
         at, tree, size = self.state.seen.at, self.state.tree, float(self.grid.voxel_size(level))
         chosen = _voxels_of(self.grid, tree, level)(at.position) & (confidence(self.state) < WEAK)
-        chosen &= self.wrong()
+        chosen &= self._wrong()
         position, normal = at.position[chosen], at.normal[chosen]
         corner = np.floor(position / size - 0.5).astype(np.int64)[:, None] + CORNERS
         height = np.einsum("nci,ni->nc", (corner + 0.5) * size - position[:, None], normal)
         corner = np.unique(corner[height > FRONT * size], axis=0)
         return corner[Atlas([tree]).find(level, corner) < 0]
 
-    def wrong(self) -> np.ndarray:
+    def _wrong(self) -> np.ndarray:
         """(n,) receivers whose error is too large to be noise."""
-        squared, noise = self.errors()
+        squared, noise = self._errors()
         return squared > max(self.target.error, CLEAR) ** 2 + SURE**2 * noise
 
-    def fill_cracks(self) -> None:
-        """Move data points to where receivers have none, in voxels that are of less use elsewhere."""
+    def _fill_cracks(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rows of data points that move to where receivers have none, in voxels that are of less use elsewhere, and
+        their offsets."""
         at, measured = self.state.seen.at, self.state.measured
-        unlit = np.flatnonzero((confidence(self.state) < ENOUGH) & self.wrong())
+        unlit = np.flatnonzero((confidence(self.state) < ENOUGH) & self._wrong())
         row = _leaves(self.grid, self.state.tree, at.position[unlit])
-        offset, free = self.in_front(unlit, row)
+        offset, free = self._in_front(unlit, row)
         unlit, row, offset = unlit[free], row[free], offset[free]
-        use, gain = self.usefulness(), np.bincount(row, at.area[unlit], len(measured.level))
+        use, gain = self._usefulness(), np.bincount(row, at.area[unlit], len(measured.level))
         order = np.lexsort((-at.area[unlit], row))
         row, first = np.unique(row[order], return_index=True)
         offset, better = offset[order][first], gain[row] > use[row]
-        if better.any():
-            effort = self.target.effort
-            measured = move(self.scene, self.grid, measured, row[better], offset[better], effort)
+        return row[better], offset[better]
+
+    def _take_moved(self, chosen: tuple[np.ndarray, np.ndarray]) -> None:
+        """Measure some data points elsewhere."""
+        row, offset = chosen
+        light = self._light_of_moved(row, offset)
+        self.moved = Moved(row, offset, light)
+        if len(row):
+            measured = move(self.unmoved, row, offset, light)
             data = interpolate.join(self.grid, [self.state.tree], measured.offset, measured.valid)
             self.state = State(self.state.tree, measured, data, self.state.seen)
 
-    def in_front(self, chosen: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _light_of_moved(self, row: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        """(m, functions, 9, 3) what data points measure elsewhere in their voxels."""
+        return moved_light(self.scene, self.grid, self.unmoved, row, offset, self.target.effort)
+
+    def _in_front(self, chosen: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(n, 3) int8 offsets half-way to what stands before receivers, within their voxels, and (n,) whether the way
         there is free."""
         at = self.state.seen.at.take(chosen)
@@ -274,14 +362,14 @@ class _Refinement:
         height = ((place.T - at.position) * at.normal).sum(axis=1)
         return offset.astype(np.int8), ~blocked & (height > 0)
 
-    def usefulness(self) -> np.ndarray:
+    def _usefulness(self) -> np.ndarray:
         """(points,) area of the receivers that each data point lights, by its share [m2]."""
         at = self.state.seen.at
         row, weight = interpolate.weigh(self.state.data, at.position, at.normal)
         share = weight / np.maximum(weight.sum(axis=1, keepdims=True), ENOUGH) * at.area[:, None]
         return np.bincount(row.ravel(), share.ravel(), len(self.state.measured.level))
 
-    def show(self) -> Callable[[float], bool] | None:
+    def _show(self) -> Callable[[float], bool] | None:
         """What the next stage is to call with the part of it that is done; each level has up to three."""
         parallel.check()
         show, stage, count = self.progress, self.stage, 3 * self.grid.levels

@@ -30,6 +30,7 @@ class Outcome:
     cells: int = 0
     data_points: int = 0
     dilated: int = 0
+    kept: int = 0
     bytes: dict[str, int] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     rays: int = 0

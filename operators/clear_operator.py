@@ -27,6 +27,7 @@ class GIVOLUMES_OT_clear(bpy.types.Operator):
         return context.window_manager.invoke_confirm(self, event)
 
     def execute(self, context):
+        from ..bake import memory
         from ..tree import folder
 
         try:
@@ -34,13 +35,15 @@ class GIVOLUMES_OT_clear(bpy.types.Operator):
             files = folder.files(place)
             if place / folder.WORLD in files:
                 folder.load_header(place)  # refuses another program's file of that name
+            files += memory.files(place)
             for file in files:
                 file.unlink(missing_ok=True)
         except (OSError, ValueError) as error:
             self.report({"ERROR"}, one_line(error))
             return {"CANCELLED"}
-        with contextlib.suppress(OSError):
-            place.rmdir()
+        for emptied in (place / memory.FOLDER, place):
+            with contextlib.suppress(OSError):
+                emptied.rmdir()
         self.report({"INFO"}, f"Removed {len(files)} files from {place}" if files else f"No bake in {place}")
         job.last = None
         return {"FINISHED"}

@@ -89,7 +89,7 @@ class Job:
     def _command(self, snapshot: Path) -> list[str]:
         """The arguments of the worker."""
         options = [text for pair in self._options.items() for text in pair]
-        return ["bake", str(snapshot), "-o", str(self.folder), "--early", *options]
+        return ["bake", str(snapshot), "-o", str(self.folder), "--early", "--incremental", *options]
 
     def _follow(self, arguments: list[str], scratch: Path) -> Iterator[Progress]:
         """Until the worker ends, however it or this iterator ends."""

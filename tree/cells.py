@@ -10,6 +10,7 @@ bake, cell and tree that they belong to.
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import math
 import os
@@ -28,7 +29,9 @@ __all__ = [
     "Cell",
     "bake_of_cell",
     "cell_path",
+    "copy_cell",
     "describe_file",
+    "digest_of_cell",
     "has_cell",
     "read_cell",
     "read_tree",
@@ -313,6 +316,59 @@ def _meta(folder: str | os.PathLike, cell: tuple[int, int]) -> dict:
         return read_cell(folder, cell).meta
     except (OSError, FileError):
         return {}
+
+
+def digest_of_cell(cell: Cell) -> str:
+    """Digest what a cell's files hold, whatever bake they belong to.
+
+    Parameters
+    ----------
+    cell : Cell
+        The cell.
+
+    Returns
+    -------
+    str
+        32 hexadecimal digits.
+    """
+    state = hashlib.sha256(topology_hash(cell.topology).encode())
+    arrays = [cell.offset, cell.valid, cell.planes.planes, cell.planes.plane]
+    arrays += [] if cell.planes.fill is None else [cell.planes.fill]
+    for name in sorted(cell.payloads):
+        table = cell.payloads[name].table
+        arrays += [cell.payloads[name].index, *(getattr(table, field.name) for field in dataclasses.fields(table))]
+    for array in arrays:
+        state.update(np.ascontiguousarray(array).data)
+    return state.hexdigest()[:32]
+
+
+def copy_cell(source: str | os.PathLike, target: str | os.PathLike, cell: tuple[int, int], bake: str) -> None:
+    """Copy a cell as it is into another bake.
+
+    Parameters
+    ----------
+    source, target : str or Path
+        Folders; the cell in the first is whole.
+    cell : (2,) int
+        World cell (i, j).
+    bake : str
+        What identifies the other bake.
+
+    Raises
+    ------
+    FileError
+        A file is damaged.
+    OSError
+        A file cannot be read or written.
+    """
+    tree = container.read(cell_path(source, cell, TREE), TREE)
+    listed = {}
+    for name in tree.meta["files"]:
+        file, path = container.read(cell_path(source, cell, name)), cell_path(target, cell, name)
+        container.write(path, file.kind, file.arrays, {**file.meta, "bake": bake}, file.units)
+        listed[name] = describe_file(path)
+    header = {**tree.meta, "bake": bake, "files": listed}
+    container.write(cell_path(target, cell, TREE), TREE, tree.arrays, header, tree.units)
 
 
 def describe_file(path: Path) -> dict:

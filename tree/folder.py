@@ -17,12 +17,36 @@ from pathlib import Path
 import numpy as np
 
 from .atomic import write_bytes_atomically
-from .cells import TREE, Cell, bake_of_cell, cell_path, describe_file, has_cell, read_cell, read_tree, write_cell
+from .cells import (
+    TREE,
+    Cell,
+    bake_of_cell,
+    cell_path,
+    copy_cell,
+    describe_file,
+    digest_of_cell,
+    has_cell,
+    read_cell,
+    read_tree,
+    write_cell,
+)
 from .container import FileError
 from .grid import Grid
 from .topology import Topology
 
-__all__ = ["Cell", "assemble", "bake_of_cell", "files", "grid_of", "has_cell", "load_header", "read_cell", "write_cell"]
+__all__ = [
+    "Cell",
+    "assemble",
+    "bake_of_cell",
+    "copy_cell",
+    "digest_of_cell",
+    "files",
+    "grid_of",
+    "has_cell",
+    "load_header",
+    "read_cell",
+    "write_cell",
+]
 
 WORLD = "world.json"
 WORLD_FORMAT = "gi_volumes world"

@@ -30,7 +30,7 @@ def parts():
     cell = outline(scene.soup.corners, grid, (0, 0), by_light=True)
     low, high = scene.soup.bounds
     cached = radiosity.around(scene, grid, np.stack([low, high + 1e-3]), Effort(64, 6, 1))
-    return cached, scene, cell, job._judge(snapshot, SETTINGS, scene)
+    return cached, scene, grid, cell.coords, job._judge(snapshot, SETTINGS, scene)
 
 
 def scaled(scene, factor: float):

@@ -127,7 +127,18 @@ print("ARGV", argv[2:], has_bpy, size, Path(argv[1]).parent.exists())
 """)
     assert "LAST done | Baked 12,345 data points, 1.5 MB in 1 min 1 s |" in said
     assert "| ('a lamp has no power',) ('sun: the scene has none',)" in said
-    options = ["-o", str(tmp_path / "out"), "--early", "--quality", "draft", "--sun", "scene", "--sky", "scene"]
+    options = [
+        "-o",
+        str(tmp_path / "out"),
+        "--early",
+        "--incremental",
+        "--quality",
+        "draft",
+        "--sun",
+        "scene",
+        "--sky",
+        "scene",
+    ]
     assert f"ARGV {[*options, '--seed', '0', '--threads', '3', '--progress', 'json']} False 21 False" in said
 
 

@@ -1,0 +1,261 @@
+"""Refines a cell with what is left of its last bake: decides and measures only where something has changed.
+
+Comes in: as for `refine`, and a `Past`. Goes out: a state as `refine` has it. Level by level the tree is the one that
+`refine` would have; but what is known is not measured again, decisions are taken over where light is much as it was,
+and errors and planes are looked at only around the others.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..tree import interpolate
+from ..tree.grid import Grid
+from ..tree.lookup import Atlas
+from ..tree.outline import Outline
+from ..tree.region import finder
+from ..tree.topology import Topology
+from . import changes, judges, occluders, parallel, receivers
+from .blocks import BLOCK, Blocks, around, beside, touch, voxels_of
+from .changes import Past
+from .measured import Measured, join, move, take
+from .memory import Memory
+from .receivers import Receivers
+from .refine import Refinement, Target
+from .scene import Scene
+from .survey import Judge, Seen, State
+
+__all__ = ["Again", "remember", "settled"]
+
+RINGS = 2
+"""How far around receivers that are decided on others are looked at: receivers that share a data point, twice."""
+
+SHARE = 0.05
+"""Part of a receiver's light that a data point has to bring for the two to count as connected."""
+
+
+class Again(Refinement):
+    """A cell that has been baked before.
+
+    Parameters
+    ----------
+    scene, outline, judge, target, progress
+        As in `Refinement`.
+    past : Past
+        What is left of that bake.
+    """
+
+    def __init__(self, scene: Scene, outline: Outline, judge: Judge, target: Target, progress, past: Past) -> None:
+        super().__init__(scene, outline, judge, target, progress)
+        self.past, self.memory, self.level = past, past.memory, 0
+        self.kept = take(past.memory.measured, past.known)
+        self.looked = [receivers.among(look.coords) for look in past.memory.looks]
+
+    def _known(self) -> Measured:
+        """What is known from before, and what has been measured since."""
+        if self.state is None:
+            return self.kept
+        new = Atlas([self.state.tree]).find(self.kept.level.astype(np.int64), self.kept.coords) < 0
+        return join(take(self.kept, new), self.state.measured)
+
+    def _found(self, level: int) -> Seen:
+        """Those that are known; others in voxels that are new or have other surfaces."""
+        self.level = level
+        of_level, coords = self.state.tree.voxels()
+        coords = coords[of_level == level]
+        known = self._is_looked(level, coords) & ~self.past.surfaces.touch(level, coords)
+        seen = self._seen_in(level, coords[~known])
+        if not known.any():
+            return seen
+        old, has = self.memory.looks[level].seen, receivers.among(coords[known])
+        return old.take(has(self._voxels(level, old.at.position))).plus(seen)
+
+    def _is_looked(self, level: int, coords: np.ndarray) -> np.ndarray:
+        """(n,) which voxels had receivers of their level."""
+        return self.looked[level](coords) if level < len(self.looked) else np.zeros(len(coords), bool)
+
+    def _open(self, level: int, coords: np.ndarray) -> np.ndarray:
+        """(n,) which voxels are to be decided on: where something has changed, and those that are new."""
+        new = (Atlas([self.state.tree]).find(level, coords) >= 0) & ~self._is_looked(level, coords)
+        return self.past.decide.touch(level, coords) | new
+
+    def _voxels(self, level: int, position: np.ndarray) -> np.ndarray:
+        """(n, 3) voxels that hold positions."""
+        return np.floor(position / float(self.grid.voxel_size(level))).astype(np.int64)
+
+    def _near(self, at: Receivers) -> np.ndarray:
+        """Receivers in voxels to be decided on, and those that share data points with them."""
+        chosen = self._open(self.level, self._voxels(self.level, at.position))
+        row, weight = interpolate.weigh(self.state.data, at.position, at.normal)
+        counts = weight > SHARE * weight.sum(axis=1, keepdims=True)
+        for _ in range(RINGS):
+            lit = np.zeros(len(self.state.data.valid), bool)
+            lit[row[chosen][counts[chosen]]] = True
+            chosen = chosen | (lit[row] & counts).any(axis=1)
+        return np.flatnonzero(chosen)
+
+    def _wanting(self, level: int) -> np.ndarray:
+        """As it was where nothing has changed."""
+        coords = self.outline.coords[level]
+        value, is_open = super()._wanting(level), self._open(level, coords)
+        if level >= len(self.memory.need):
+            return value
+        old, need = self.memory.need[level]
+        row = finder(old)(coords)
+        return np.where(is_open, value, np.where(row >= 0, need[row] if len(need) else 0.0, 0.0))
+
+    def _unlit(self, level: int) -> np.ndarray:
+        """With those of before, where nothing has changed."""
+        old = self.memory.asked[level] if level < len(self.memory.asked) else np.zeros((0, 3), np.int64)
+        old = old[~self.past.decide.touch(level, old)]
+        return np.unique(np.concatenate([old, super()._unlit(level)]), axis=0)
+
+    def _wrong(self) -> np.ndarray:
+        """Only where it is to be decided."""
+        return super()._wrong() & self._open(self.level, self._voxels(self.level, self.state.seen.at.position))
+
+    def _fill_cracks(self) -> tuple[np.ndarray, np.ndarray]:
+        """With those that were moved before, where nothing has changed."""
+        row, offset = super()._fill_cracks()
+        old = self._rows_of_moved()
+        kept = np.flatnonzero((old >= 0) & ~np.isin(old, row))
+        return np.concatenate([row, old[kept]]), np.concatenate([offset, self.memory.moved.offset[kept]])
+
+    def _light_of_moved(self, row: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        """As it is known."""
+        old, moved = self._rows_of_moved(), self.memory.moved
+        place = np.full(self.state.tree.size, -1)
+        place[old[old >= 0]] = np.flatnonzero(old >= 0)
+        found = place[row]
+        same = np.flatnonzero((found >= 0) & (moved.offset[found] == offset).all(axis=1)) if len(old) else found[:0]
+        out = np.zeros((len(row), *self.unmoved.light.shape[1:]), np.float32)
+        new = np.setdiff1d(np.arange(len(row)), same)
+        out[same], out[new] = moved.light[found[same]], super()._light_of_moved(row[new], offset[new])
+        return out
+
+    def _rows_of_moved(self) -> np.ndarray:
+        """(m,) rows in the tree of the voxels whose data points were moved before; -1 where it is to be decided."""
+        some = take(self.memory.measured, self.memory.moved.row)
+        row = Atlas([self.state.tree]).find(some.level.astype(np.int64), some.coords)
+        return np.where(touch(self.past.decide, some), -1, row)
+
+    def _hide_finally(self) -> None:
+        """Planes of before where neither tree nor surfaces have changed, nor data points been moved; others anew."""
+        parallel.check()
+        tree, measured, threads = self.state.tree, self.state.measured, self.target.effort.threads
+        fine = measured.level >= BLOCK
+        new = beside(self._changed_voxels(), measured) | fine & around(self.past.surfaces, measured)
+        new |= touch(self.past.surfaces, measured)
+        row = _rows(tree, self.memory.tree)
+        planes = np.where(row[:, None] >= 0, self.memory.planes[np.maximum(row, 0)], -1)
+        plane = self.memory.plane
+        if new.any():
+            hidden = occluders.fit(self.scene, self.state.data, self._judges_of(new), threads, only=new)
+            planes[new] = np.where(hidden.planes[new] >= 0, hidden.planes[new] + len(plane), -1)
+            plane = np.concatenate([plane, hidden.plane])
+        self._set_planes(*_distinct(planes, plane))
+
+    def _changed_voxels(self) -> Blocks:
+        """Voxels that are new, are gone, or have another data point."""
+        memory, here = self.memory, self.state.measured
+        there = move(memory.measured, memory.moved.row, memory.moved.offset, memory.moved.light)
+        row = _rows(self.state.tree, memory.tree)
+        new = row < 0
+        off = ~new & ((here.offset != there.offset[row]).any(axis=1) | (here.valid != there.valid[row]))
+        gone = _rows(memory.tree, self.state.tree) < 0
+        return Blocks([*voxels_of(take(here, new | off)).marks, *voxels_of(take(there, gone)).marks])
+
+    def _judges_of(self, new: np.ndarray) -> Receivers:
+        """Receivers that some data points may light: as dense as in a first bake around fine ones and leaves, around
+        other coarse ones those whose light is traced."""
+        tree, measured, at = self.state.tree, self.state.measured, self.state.seen.at
+        coarse = (np.arange(tree.size) < len(tree.nodes)) & (measured.level < BLOCK)
+        coarse[: len(tree.nodes)] &= tree.nodes["mask"] != 0
+        close = beside(voxels_of(take(measured, new & ~coarse)), measured)
+        dense = judges.around(self.scene, self.grid, tree, self.target.effort.threads, close)
+        others, seen = voxels_of(take(measured, new & coarse)), np.zeros(len(at.key), bool)
+        for level in range(BLOCK):
+            seen |= others.beside(level, self._voxels(level, at.position))
+        return receivers.join([dense, at.take(seen)])
+
+
+def _distinct(planes: np.ndarray, plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Planes that are used, each once, as `Occluders` has them."""
+    used = planes >= 0
+    table, row = np.unique(plane[planes[used]].reshape(-1, 5), axis=0, return_inverse=True)
+    out = np.full(planes.shape, -1, np.int32)
+    out[used] = row.reshape(-1)
+    return out, table
+
+
+def settled(past: Past, grid: Grid) -> State:
+    """Give a cell the light of today where its tree stays as it is.
+
+    Parameters
+    ----------
+    past : Past
+        Without anything to decide.
+    grid : Grid
+        The lattice.
+
+    Returns
+    -------
+    State
+        As it was, with other light.
+    """
+    memory = past.memory
+    measured = memory.measured
+    if len(memory.moved.row):
+        measured = move(measured, memory.moved.row, memory.moved.offset, memory.moved.light)
+    data = interpolate.join(grid, [memory.tree], measured.offset, measured.valid, memory.planes, memory.plane)
+    seen = memory.looks[0].seen
+    for look in memory.looks[1:]:
+        seen = seen.plus(look.seen)
+    return State(memory.tree, measured, data, seen.take(memory.current))
+
+
+def remember(made: Refinement, judge: Judge, causes: dict[str, str], rules: str, past: Past | None) -> Memory:
+    """Put together what the next bake may use.
+
+    Parameters
+    ----------
+    made : Refinement
+        A cell that has been refined.
+    judge : Judge
+        Its judge.
+    causes : dict of str to str
+        From `changes.causes`.
+    rules : str
+        Digest of the settings.
+    past : Past, optional
+        What was known before.
+
+    Returns
+    -------
+    Memory
+        Without the digest of its files.
+    """
+    state, scene, views = made.state, made.scene, judge.views if past is None else past.memory.views
+    paths = np.zeros((state.tree.size, len(views), 9), np.float32)
+    row = np.full(state.tree.size, -1) if past is None else _rows(state.tree, past.memory.tree)
+    kept = (row >= 0) & (past.known[row] if past is not None else False)
+    if past is not None:
+        paths[kept] = past.pilot[row[kept]]
+    new = take(made.unmoved, ~kept)
+    paths[~kept] = changes.pilot(scene, made.grid, new, views, made.target.effort)
+    current = np.zeros(sum(len(look.seen.at.key) for look in made.looks), bool)
+    current[made.current] = True
+    need = [
+        (coords[value > 0], value[value > 0]) for coords, value in zip(made.outline.coords, made.need, strict=False)
+    ]
+    surfaces = changes.triangles_near(scene, made.grid, state.tree.cell)
+    own = made.unmoved, made.moved, paths, views, made.looks, current, need, made.asked
+    return Memory(
+        state.tree, *own, state.data.planes, state.data.plane, *surfaces, scene.cache is not None, causes, rules
+    )
+
+
+def _rows(tree: Topology, other: Topology) -> np.ndarray:
+    """(size,) row of each voxel of a tree in another one; -1 where it has none."""
+    level, coords = tree.voxels()
+    return Atlas([other]).find(level.astype(np.int64), coords)
