@@ -23,6 +23,7 @@ from .gather import Effort, gather
 from .lamps import LUMINANCE
 from .measured import Measured, moved_light, positions, split, stack, take
 from .memory import Look, Memory, Moved, digest
+from .receivers import Receivers
 from .scene import Scene, SunDirections
 from .sensors import HarmonicsSensor
 from .snapshot import LightKind, Snapshot
@@ -202,18 +203,19 @@ def compare(memory: Memory, scene: Scene, grid: Grid, now: dict[str, str], effor
     views = [list(columns).index(name) for name in names]
     pooled, own = (change[:, views] for change in _relative_changes(grid, memory, paths, known))
     bound = np.array([memory.bounds[name] for name in names])
-    stale = known & ((pooled > TOLERANCE * bound) | (own > bound)).any(axis=1)
-    old, new = (dict(pools(grid, take(measured, rows & known & measured.valid))) for rows in (~stale, stale))
+    wide, alone = known & (pooled > TOLERANCE * bound).any(axis=1), known & (own > bound).any(axis=1)
+    stale = wide | alone
     restless = pools(grid, take(measured, known & (pooled > DECIDE).any(axis=1)))
     decide = Blocks([*surfaces.marks, *((int(pool_level(grid, level)), coords) for level, coords in restless)])
     paths[~stale] = memory.pilot[~stale]
     number = np.concatenate([np.zeros(0, np.int64), *(columns[name] for name in names)])
+    known_there = _Around(grid, take(measured, known & measured.valid), take(measured, wide), take(measured, alone))
     update = _Update(_only(scene, names), grid, number, effort, samples)
     memory = dataclasses.replace(
         memory,
         measured=update.measured(measured, stale),
         moved=update.moved(memory, stale),
-        looks=[update.look(level, look, old, new) for level, look in enumerate(memory.looks)],
+        looks=[update.look(look, known_there.rows(level, look.seen.at)) for level, look in enumerate(memory.looks)],
     )
     return Past(memory, paths, surfaces, decide, bool(surfaces) or bool(stale.any()), int((known & ~stale).sum()))
 
@@ -242,19 +244,10 @@ class _Update:
         light[rows[:, None], self.columns] = self._light(memory.measured, moved.row[rows], moved.offset[rows])
         return dataclasses.replace(moved, light=light)
 
-    def look(self, level: int, look: Look, old: dict[int, np.ndarray], new: dict[int, np.ndarray]) -> Look:
-        """Receivers of a level; those around which light has changed in a pool of its data points are traced, and those
-        around which there is none."""
+    def look(self, look: Look, rows: np.ndarray) -> Look:
+        """Receivers of a level, some of them with light of today."""
         if not len(self.columns):
             return look
-        none, size = np.zeros((0, 3), np.int64), float(self.grid.voxel_size(level))
-        is_old, is_new = (receivers.among(part.get(level, none)) for part in (old, new))
-        width = float(self.grid.voxel_size(int(pool_level(self.grid, level))))
-        known, changed = np.zeros((2, len(look.seen.at.key)), bool)
-        for corner in CORNERS - 0.5:
-            pool = np.floor((look.seen.at.position + corner * size) / width).astype(np.int64)
-            known, changed = known | is_old(pool), changed | is_new(pool)
-        rows = np.flatnonzero(changed | ~known)
         fresh = trace(self.scene, look.seen.at.take(rows), dataclasses.replace(self.effort, samples=self.samples))
         light = look.seen.light.copy()
         light[:, rows[:, None], self.columns] = fresh.light
@@ -263,6 +256,29 @@ class _Update:
     def _light(self, measured: Measured, rows: np.ndarray, offset: np.ndarray) -> np.ndarray:
         """(m, columns, 9, 3) light in some voxels."""
         return moved_light(self.scene, self.grid, measured, rows, offset, self.effort)
+
+
+class _Around:
+    """Says for which receivers light has changed: those with a data point of their level around them that has changed
+    by itself or with its pool, and those without any that is known."""
+
+    def __init__(self, grid: Grid, known: Measured, wide: Measured, alone: Measured) -> None:
+        self.grid = grid
+        self.known, self.wide = dict(pools(grid, known)), dict(pools(grid, wide))
+        self.alone = {int(level): alone.coords[alone.level == level] for level in np.unique(alone.level)}
+
+    def rows(self, level: int, at: Receivers) -> np.ndarray:
+        """(m,) which receivers of a level."""
+        none, size = np.zeros((0, 3), np.int64), float(self.grid.voxel_size(level))
+        is_known, is_wide, is_alone = (
+            receivers.among(part.get(level, none)) for part in (self.known, self.wide, self.alone)
+        )
+        ratio = round(float(self.grid.voxel_size(int(pool_level(self.grid, level)))) / size)
+        known, changed = np.zeros((2, len(at.key)), bool)
+        for corner in CORNERS - 0.5:
+            voxel = np.floor(at.position / size + corner).astype(np.int64)
+            known, changed = known | is_known(voxel // ratio), changed | is_wide(voxel // ratio) | is_alone(voxel)
+        return np.flatnonzero(changed | ~known)
 
 
 def _only(scene: Scene, names: list[str]) -> Scene:

@@ -40,6 +40,9 @@ EXPECTED = (SnapshotError, SettingsError, container.FileError, OSError, ValueErr
 MAY_BE_NEGATIVE = ("--sun", "--sky", "--cells", "--finest")
 """Options whose value may begin with a minus, which would otherwise pass for an option."""
 
+MOST_SAMPLES = 1 << 20
+"""Paths of a point beyond which noise is less than rounding."""
+
 Extract = Callable[[Path, Path], None]
 
 
@@ -176,10 +179,12 @@ def _add_light(command: argparse.ArgumentParser) -> None:
 
 def _add_bake(commands) -> None:
     command = _add_command(commands, "bake", "bake a scene into a folder", _run_bake, _show_bake)
-    command.add_argument("scene", type=_path, metavar="SCENE", help=".blend, .glb, .gltf, or a snapshot (.giv)")
-    command.add_argument("-o", "--output", type=_path, required=True, metavar="DIR")
+    text = ".blend, .glb, .gltf, or a snapshot (.giv); inside Blender the open file where it is left out"
+    command.add_argument("scene", type=_path, metavar="SCENE", help=text)
+    text = "folder of the bake; inside Blender that of the scene's settings where it is left out"
+    command.add_argument("-o", "--output", type=_path, required=True, metavar="DIR", help=text)
     command.add_argument("--quality", choices=tuple(QUALITIES), default="preview")
-    command.add_argument("--samples", type=_positive, help="paths per data point, instead of the quality's")
+    command.add_argument("--samples", type=_samples, help="paths per data point, instead of the quality's")
     text = "cache ends paths on surfaces whose light is known; paths follows each to its end"
     command.add_argument("--method", choices=("cache", "paths"), default="cache", help=text)
     command.add_argument("--finest", type=float, default=0.0, help="size of the finest voxels in metres")
@@ -211,7 +216,7 @@ def _add_reference(commands) -> None:
     command = _add_command(commands, "reference", "path-traced irradiance at points", _run_reference, None)
     command.add_argument("scene", type=_path, metavar="SCENE")
     _add_points(command)
-    command.add_argument("--samples", type=_positive, default=1024, help="paths per point")
+    command.add_argument("--samples", type=_samples, default=1024, help="paths per point (1024)")
     _add_light(command)
 
 
@@ -222,7 +227,7 @@ def _add_compare(commands) -> None:
     command.add_argument("-o", "--output", type=_path, required=True, metavar="IMAGE", help=".png or .exr")
     command.add_argument("--camera", help="its name; the scene's active camera without it")
     command.add_argument("--size", type=_size, default=(480, 270), metavar="WxH", help="of each of the three pictures")
-    command.add_argument("--samples", type=_positive, default=256, help="paths per pixel of the reference")
+    command.add_argument("--samples", type=_samples, default=256, help="paths per pixel of the reference (256)")
     command.add_argument("--transport", choices=("local", "sun", "sky", "all"), default="all")
     command.add_argument("--threads", type=_natural, default=0)
     command.add_argument("--progress", choices=("text", "json"), default="text")
@@ -290,6 +295,9 @@ def _run_query(options, extract: Extract, progress: Progress) -> dict:
     expected = len(loaded.header.get("expected_cells", loaded.cells))
     if len(loaded.cells) < expected:
         print(f"warning: {expected - len(loaded.cells)} of {expected} cells are not baked yet", file=sys.stderr)
+    early = sum(bool(entry.get("early")) for entry in loaded.header["cells"])
+    if early:
+        print(f"warning: {early} of {expected} cells are an early look, not baked to their end", file=sys.stderr)
     sun = None if direction is None else (direction, loaded.sun_irradiance)
     values = loaded.irradiance(points, normals, sun=sun, transport=options.transport)
     write_array(options.output, values)
@@ -340,13 +348,14 @@ def _show_bake(result: dict) -> str:
     for item in result["checked"]:
         bias = f"{100 * item['bias']:+.1f} +- {100 * item['bias_error']:.1f} %"
         lines.append(
-            f"{item['what']} by the surface cache: {bias} off on average, noise {100 * item['noise']:.1f} % before the "
-            f"fit (beside paths, at {item['places']} places)"
+            f"{item['what']}: the surface cache is {bias} off on average, as paths show at {item['places']} places; a "
+            f"data point's noise is {100 * item['noise']:.1f} %, before the fit to surfaces averages it out"
         )
     if result["kept"]:
         lines.append(f"kept as they were measured before: {result['kept']} data points")
     lines += [f"left out: {item['what']}: {item['why']}" for item in result["left_out"]]
     lines += [f"warning: {text}" for text in result["warnings"]]
+    lines.append(f"written to {result['folder']}")
     return "\n".join(lines)
 
 
@@ -369,6 +378,14 @@ def _natural(text: str) -> int:
 
 def _positive(text: str) -> int:
     return _whole(text, 1)
+
+
+def _samples(text: str) -> int:
+    """Paths that end within a lifetime."""
+    value = _whole(text, 1)
+    if value > MOST_SAMPLES:
+        raise argparse.ArgumentTypeError(f"{text!r}: at most {MOST_SAMPLES} paths")
+    return value
 
 
 def _points(text: str) -> int:

@@ -81,7 +81,7 @@ WHITE = np.array([[np.sqrt(4 * np.pi)] * 3] + [[0.0] * 3] * 8)
 STEPS = 1000
 """Units of progress in a cell."""
 
-RECHECKED = VOXELS // 4
+RECHECKED = VOXELS // 8
 """Voxels at which the surface cache of a cell that has been baked before is checked."""
 
 
@@ -173,6 +173,7 @@ def bake(
         outcome.warnings += summary.dark(list(header["transports"]), list(work.arriving.values()))
     if len(listed) < len(occupied):
         outcome.warnings.append(f"{len(occupied) - len(listed)} of the scene's {len(occupied)} cells are not baked yet")
+    outcome.folder = str(target.absolute())
     outcome.seconds = progress.seconds
     outcome.rays = scene.tracer.rays
     outcome.bytes = summary.file_sizes(listed)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import shutil
 import tempfile
 import threading
@@ -43,16 +44,24 @@ def check_target(target: Path) -> None:
     Raises
     ------
     SettingsError
-        It is a file, or another program's `world.json` is in it.
+        It is a file, cannot be made, or another program's `world.json` is in it.
     """
     if target.exists() and not target.is_dir():
         raise SettingsError(f"{target}: this is a file; a bake needs a folder")
+    parent = next((path for path in target.absolute().parents if path.exists()), target)
+    if not target.exists() and not (parent.is_dir() and os.access(parent, os.W_OK | os.X_OK)):
+        why = "cannot be written to" if parent.is_dir() else "is a file"
+        raise SettingsError(f"{target}: {parent} {why}; choose another folder for the bake")
     if (target / folder.WORLD).is_dir():
         raise SettingsError(f"{target / folder.WORLD}: this is a folder; choose another folder for the bake")
     try:
         content = json.loads((target / folder.WORLD).read_bytes())
-    except (OSError, ValueError, RecursionError):
+    except OSError:
         return
+    except (ValueError, RecursionError):
+        if any(path.suffix == f".{folder.TREE}" for path in folder.files(target)):
+            return  # a damaged list of a bake's cells
+        content = None
     if not isinstance(content, dict) or content.get("format") != folder.WORLD_FORMAT:
         raise SettingsError(f"{target / folder.WORLD}: another program's file; choose another folder for the bake")
 

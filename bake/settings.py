@@ -130,7 +130,7 @@ def with_sky(snapshot: Snapshot, sky: str) -> tuple[Snapshot, str]:
     if sky == "harmonics":
         return snapshot, "harmonics"
     if sky != "scene":
-        radiance = numbers(sky, "--sky", (1, 3))
+        radiance = numbers(sky, "--sky", (1, 3), "scene, harmonics")
         if (radiance < 0).any():
             raise SettingsError(f"--sky {sky}: radiance cannot be negative")
         if (radiance > np.finfo(np.float32).max).any():
@@ -171,7 +171,7 @@ def sun_keys(snapshot: Snapshot, sun: str) -> SunDirections:
     elif sun.startswith("arc:"):
         toward = _read_arc(Path(sun.removeprefix("arc:")))
     else:
-        toward = numbers(sun, "--sun", (3,))[None]
+        toward = numbers(sun, "--sun", (3,), "scene, none, hemisphere, arc:FILE")[None]
     _check_count(len(toward), sun)
     diameter = own.diameter[0] if len(own.diameter) else 0.0
     toward = unit(toward, f"--sun {sun}").astype(np.float32)
@@ -323,7 +323,7 @@ def choose_grid(corners: np.ndarray, origin: np.ndarray, finest: float, levels: 
     return Grid(finest * lattice.BRANCH ** (levels - 1), levels, tuple(origin))
 
 
-def numbers(text: str, option: str, counts: tuple[int, ...]) -> np.ndarray:
+def numbers(text: str, option: str, counts: tuple[int, ...], others: str = "") -> np.ndarray:
     """Numbers separated by commas.
 
     Parameters
@@ -334,6 +334,8 @@ def numbers(text: str, option: str, counts: tuple[int, ...]) -> np.ndarray:
         Its name, for the message.
     counts : tuple of int
         How many numbers there may be.
+    others : str
+        What may be written instead, for the message.
 
     Returns
     -------
@@ -351,7 +353,8 @@ def numbers(text: str, option: str, counts: tuple[int, ...]) -> np.ndarray:
         values = np.zeros(0)
     if len(values) not in counts or not np.isfinite(values).all():
         wanted = " or ".join(str(count) for count in counts)
-        raise SettingsError(f"{option} {text}: want {wanted} finite number(s) separated by commas")
+        words = f"{others}, or " if others else ""
+        raise SettingsError(f"{option} {text}: use {words}{wanted} numbers with commas between them")
     return values
 
 
@@ -377,7 +380,8 @@ def unit(vectors: np.ndarray, what: str) -> np.ndarray:
     """
     largest = np.abs(vectors).max(axis=1, keepdims=True, initial=0.0)
     if (largest == 0).any():
-        raise SettingsError(f"{what}: direction {int(np.argmin(largest))} has no length")
+        which = f"direction {int(np.argmin(largest)) + 1} is" if len(vectors) > 1 else "that is"
+        raise SettingsError(f"{what}: {which} 0,0,0, which points nowhere; give another direction")
     vectors = vectors / largest
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
@@ -389,10 +393,17 @@ def _read_arc(path: Path) -> np.ndarray:
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is no text"
         raise SettingsError(f"--sun arc:{path}: cannot be read ({reason})") from error
-    lines = [",".join(line.replace(",", " ").split()) for line in text.splitlines() if line.strip()]
-    if not lines:
-        raise SettingsError(f"--sun arc:{path}: holds no directions; write one per line as x y z")
-    return np.stack([numbers(line, f"--sun arc:{path}, line", (3,)) for line in lines])
+    found = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.replace(",", " ").split()
+        try:
+            found += [numbers(",".join(words), "", (3,))] if words else []
+        except SettingsError:
+            place = f"--sun arc:{path}: line {number} ({line.strip()})"
+            raise SettingsError(f"{place}: write three numbers, as in 0 0.5 1") from None
+    if not found:
+        raise SettingsError(f"--sun arc:{path}: holds no directions; write one per line, as in 0 0.5 1")
+    return np.stack(found)
 
 
 def check_scene(snapshot: Snapshot) -> None:

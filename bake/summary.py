@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..tree.grid import Grid
+from ..tree.suns import SunKeys
 from . import snapshot_file
 from .check import Check
 from .reference import sun_strength
@@ -26,6 +27,7 @@ UNKNOWN = 1e9
 class Outcome:
     """What a bake did, as the command line's JSON object."""
 
+    folder: str = ""
     triangles: int = 0
     cells: int = 0
     data_points: int = 0
@@ -85,11 +87,13 @@ def _sun_header(snapshot: Snapshot, settings: Settings, light: Model) -> dict:
     """Key directions, and the suns that shine when nobody says otherwise: the scene's, or the one asked for."""
     shining = (scene_suns(snapshot) if has_free_sun(settings.sun) else light.suns).toward
     strength = sun_strength(snapshot, len(shining))
+    free = has_free_sun(settings.sun)
     return {
         "unit": "1, irradiance per W/m2 of sun on a surface facing it",
         "directions": light.suns.toward.tolist(),
         "diameters": light.suns.diameter.tolist(),
-        "free": has_free_sun(settings.sun),
+        "free": free,
+        "triangles": SunKeys(light.suns.toward).triangles.tolist() if free else [],
         "scene": [
             {"direction": direction.tolist(), "irradiance": irradiance.tolist()}
             for direction, irradiance in zip(shining, strength, strict=True)
@@ -117,7 +121,7 @@ def describe(snapshot: Snapshot, settings: Settings, scene: Scene, trees: list) 
         Without what is known of files, times and light.
     """
     light = scene.model
-    outcome = Outcome(len(scene.soup.corners), len(trees), sum(tree.size for tree in trees))
+    outcome = Outcome("", len(scene.soup.corners), len(trees), sum(tree.size for tree in trees))
     outcome.dilated = sum(tree.dilated for tree in trees)
     parts = {
         "local": (scene.has_local, "the scene has no lamps and no emissive surfaces"),
@@ -130,6 +134,11 @@ def describe(snapshot: Snapshot, settings: Settings, scene: Scene, trees: list) 
             outcome.modelled.append(name)
         else:
             outcome.left_out.append({"what": name, "why": why})
+    if not outcome.modelled:
+        remedy = "--sky 1.0 gives it a sky, --sun x,y,z a sun"
+        outcome.warnings.append(
+            f"the scene has no light to bake: no lamps, no emissive surfaces, no sun, no sky; {remedy}"
+        )
     skipped = sum(tree.left_out for tree in trees)
     if skipped:
         limit = f"{settings.max_points:,} data points" + f" and {settings.max_bytes:,} bytes" * bool(settings.max_bytes)

@@ -165,7 +165,8 @@ def draw_outcome(layout: bpy.types.UILayout, outcome: job.Outcome | None) -> Non
     icons = {"done": "CHECKMARK", "stopped": "INFO", "failed": "ERROR"}
     column = layout.column(align=True)
     draw_text(column, outcome.message, icons[outcome.kind])
-    notes = [(text, "ERROR") for text in outcome.warnings] + [(text, "DOT") for text in outcome.left_out]
+    notes = [(text, "ERROR") for text in outcome.warnings]
+    notes += [(f"Left out: {text}", "DOT") for text in outcome.left_out]
     for text, icon in notes[:MOST_NOTES]:
         draw_text(column, text, icon)
     if len(notes) > MOST_NOTES:

@@ -120,7 +120,10 @@ def load_header(folder: str | os.PathLike) -> dict:
     """
     path = Path(folder) / WORLD
     if not Path(folder).is_dir():
-        raise FileNotFoundError(2, "no such folder", os.fspath(folder))
+        reason = "this is a file, not the folder of a bake" if Path(folder).exists() else "no such folder"
+        raise FileNotFoundError(2, reason, os.fspath(folder))
+    if not files(folder):
+        raise FileNotFoundError(2, f"the folder holds no bake: it has no {WORLD}", os.fspath(folder))
     if path.stat().st_size > MAX_WORLD_BYTES:
         raise FileError(path, 0, "the file is too long for a world.json")
     text = path.read_bytes()

@@ -52,7 +52,8 @@ def verify(path: str | os.PathLike) -> list[Defect]:
         When there is no such folder.
     """
     if not Path(path).is_dir():
-        raise FileNotFoundError(2, "no such folder", os.fspath(path))
+        reason = "this is a file, not the folder of a bake" if Path(path).exists() else "no such folder"
+        raise FileNotFoundError(2, reason, os.fspath(path))
     try:
         header = folder.load_header(path)
     except (OSError, FileError) as error:

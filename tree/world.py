@@ -160,6 +160,8 @@ class World:
         if sun is None:
             direction, irradiance = self._own_direction, self._own_irradiance
         else:
+            if not isinstance(sun, tuple | list) or len(sun) != 2 or np.size(sun[0]) % 3:
+                raise ValueError("sun is a pair of direction and irradiance: ((x, y, z), 2.0)")
             direction = _finite(sun[0], "sun direction").reshape(-1, 3)
             irradiance = np.broadcast_to(_finite(sun[1], "sun irradiance"), (len(direction), 3))
             self._check_sun(direction)

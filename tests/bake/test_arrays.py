@@ -88,5 +88,5 @@ def test_an_array_of_anything_else_is_refused_and_executes_nothing(baked, tmp_pa
 
 
 def test_normals_without_length_and_unequal_numbers_are_refused(baked, tmp_path):
-    assert "has no length" in call("query", baked, *Points(tmp_path, np.ones((2, 3)), np.zeros((2, 3))).words).reason
+    assert "points nowhere" in call("query", baked, *Points(tmp_path, np.ones((2, 3)), np.zeros((2, 3))).words).reason
     assert "2 rows and" in call("query", baked, *Points(tmp_path, np.ones((2, 3)), np.ones((3, 3))).words).reason

@@ -151,7 +151,9 @@ def test_a_scene_that_blender_cannot_read_gives_its_reason_and_leaves_the_bake_a
 def test_an_output_that_is_no_folder_is_refused(level, tmp_path):
     (tmp_path / "file").write_text("x")
     assert call("bake", level, "-o", tmp_path / "file").reason.endswith("this is a file; a bake needs a folder")
-    assert "file/below: Not a directory" in call("bake", level, "-o", tmp_path / "file" / "below", *QUICK).reason
+    assert (
+        "file is a file; choose another folder" in call("bake", level, "-o", tmp_path / "file" / "below", *QUICK).reason
+    )
     assert content(tmp_path) == {"file": b"x"}
 
 

@@ -13,6 +13,8 @@ import pytest
 from command_line import QUICK, SUN, Points, call, cells_only, ground_points, stored, succeed, yard
 from gi_volumes.bake import snapshot_file
 from gi_volumes.bake.job import STEPS
+from gi_volumes.tree.folder import load_header
+from gi_volumes.tree.suns import SunKeys
 
 RESULT = {"triangles", "cells", "data_points", "bytes", "seconds", "rays", "modelled", "left_out", "warnings"}
 
@@ -305,15 +307,15 @@ REFUSED = [
     ("--finest", "-1", "use a power of two"),
     ("--finest", "0.00390625", "too fine for a scene"),
     ("--finest", str(2.0**1000), "too coarse for a scene"),
-    ("--sky", "blue", "want 1 or 3 finite number(s)"),
-    ("--sky", "1,2", "want 1 or 3 finite number(s)"),
-    ("--sky", "inf", "want 1 or 3 finite number(s)"),
+    ("--sky", "blue", "use scene, harmonics, or 1 or 3 numbers"),
+    ("--sky", "1,2", "use scene, harmonics, or 1 or 3 numbers"),
+    ("--sky", "inf", "use scene, harmonics, or 1 or 3 numbers"),
     ("--sky", "-1", "cannot be negative"),
     ("--sky", "1e39", "single precision"),
-    ("--sun", "up", "want 3 finite number(s)"),
-    ("--sun", "1,2", "want 3 finite number(s)"),
-    ("--sun", "nan,0,1", "want 3 finite number(s)"),
-    ("--sun", "0,0,0", "has no length"),
+    ("--sun", "up", "use scene, none, hemisphere, arc:FILE, or 3 numbers"),
+    ("--sun", "1,2", "use scene, none, hemisphere, arc:FILE, or 3 numbers"),
+    ("--sun", "nan,0,1", "use scene, none, hemisphere, arc:FILE, or 3 numbers"),
+    ("--sun", "0,0,0", "points nowhere"),
     ("--sun", "arc:missing", "cannot be read"),
     ("--sun", "arc:.", "cannot be read"),
     ("--cells", "9,9", "no geometry there; this scene has cells 0,0"),
@@ -350,7 +352,12 @@ def test_limits_are_kept_and_what_they_leave_out_is_said(level, tmp_path):
 
 @pytest.mark.parametrize(
     ("text", "reason"),
-    [("\n", "holds no directions"), ("1 0 1\n1 2\n", "want 3 finite"), ("0 0 1\n" * 65, "at most 64"), ("é", "want 3")],
+    [
+        ("\n", "holds no directions"),
+        ("1 0 1\n1 2\n", "line 2 (1 2): write three numbers"),
+        ("0 0 1\n" * 65, "at most 64"),
+        ("é", "line 1 (é): write three"),
+    ],
 )
 def test_a_file_of_sun_directions_is_checked_before_the_bake(level, tmp_path, text, reason):
     (tmp_path / "arc").write_text(text)
@@ -380,6 +387,7 @@ def test_the_surface_cache_follows_light_for_longer_unless_told_otherwise(level,
         ["bake", "level.giv", "-o", "out", "--samples", "many"],
         ["bake", "level.giv", "-o", "out", "--sam", "4"],
         ["bake", "level.giv", "-o", "out", "--seed", "-1"],
+        ["bake", "level.giv", "-o", "out", "--samples", "9999999999"],
         ["bake", "level.giv", "-o", "out", "--threads", "1.5"],
         ["bake", "level.giv", "-o", "out", "--cells", ""],
         ["bake", "level.giv", "-o", "out", "--cells", "0,0/1"],
@@ -448,3 +456,20 @@ def test_a_name_that_the_terminal_cannot_write_does_not_lose_the_result(tmp_path
     done = python("bake", stored(tmp_path, named), "-o", tmp_path / "out", *QUICK, env=environment)
     assert done.returncode == 0, done.stderr
     assert "left out: mur d'\\xe9t\\xe9 \\u58c1: a wall" in done.stdout
+
+
+def test_a_scene_without_any_light_is_named(tmp_path):
+    level = stored(tmp_path, yard(lamp=False, sun=False, sky=(0, 0, 0)))
+    warnings = succeed("bake", level, "-o", tmp_path / "out", *QUICK)["warnings"]
+    assert any("no light to bake" in text and "--sky 1.0" in text for text in warnings)
+
+
+def test_a_bake_says_where_it_is(level, tmp_path):
+    said = call("bake", level, "-o", tmp_path / "out", *QUICK)
+    assert said.out.splitlines()[-1] == f"written to {tmp_path / 'out'}"
+
+
+def test_the_triangles_of_a_free_sun_are_those_that_a_look_up_takes(baked_hemisphere):
+    sun = load_header(baked_hemisphere)["transports"]["sun"]
+    assert sun["triangles"] == SunKeys(np.array(sun["directions"])).triangles.tolist()
+    assert len(sun["triangles"]) > 10

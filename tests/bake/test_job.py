@@ -239,6 +239,8 @@ def test_an_early_look_shows_every_cell_and_counts_as_not_baked(row, row_baked, 
     asked = Points(tmp_path, *ground_points(100))
     early, final = (asked.ask("query", tmp_path / "early"), asked.ask("query", row.parent / "whole"))
     assert np.median(np.abs(early / final - 1)) < 0.3
+    said = call("query", tmp_path / "early", *asked.words)
+    assert said.err == f"warning: {CELLS} of {CELLS} cells are an early look, not baked to their end\n"
 
 
 def test_a_bake_that_goes_on_after_an_early_look_is_the_same(row, row_baked, tmp_path):
@@ -398,7 +400,9 @@ def test_the_files_of_another_bake_go_also_when_its_list_is_lost(row, tmp_path):
     assert {name.split(".")[0] for name in cells_only(tmp_path)} == {"cell_1_0"}
 
 
-@pytest.mark.parametrize("text", ["{}", "[1]", '{"format": "a game\'s world", "cells": []}'])
+@pytest.mark.parametrize(
+    "text", ["{}", "[1]", "my notes on the world", "", '{"format": "a game\'s world", "cells": []}']
+)
 def test_another_program_s_world_is_not_replaced(row, tmp_path, text):
     (tmp_path / "world.json").write_text(text)
     assert "another program's file" in call("bake", row, "-o", tmp_path, *QUICK).reason
