@@ -16,7 +16,7 @@ from ..tree.outline import Outline
 from ..tree.region import finder
 from ..tree.topology import Topology
 from . import changes, judges, occluders, parallel, receivers
-from .blocks import BLOCK, Blocks, around, beside, touch, voxels_of
+from .blocks import BLOCK, Blocks, beside, touch, voxels_of
 from .changes import Past
 from .measured import Measured, join, move, take
 from .memory import Memory
@@ -143,13 +143,14 @@ class Again(Refinement):
         """Planes of before where neither tree nor surfaces have changed, nor data points been moved; others anew."""
         parallel.check()
         tree, measured, threads = self.state.tree, self.state.measured, self.target.effort.threads
-        fine = measured.level >= BLOCK
-        new = beside(self._changed_voxels(), measured) | fine & around(self.past.surfaces, measured)
-        new |= touch(self.past.surfaces, measured)
+        new = beside(self._changed_voxels(), measured) | touch(self.past.surfaces, measured)
+        for blocks in (self.past.surfaces, self.past.beyond):
+            new |= changes.lights(blocks, tree, measured)
         row = _rows(tree, self.memory.tree)
         planes = np.where(row[:, None] >= 0, self.memory.planes[np.maximum(row, 0)], -1)
         plane = self.memory.plane
         if new.any():
+            self._set_planes(np.where(new[:, None], -1, planes), plane)
             hidden = occluders.fit(self.scene, self.state.data, self._judges_of(new), threads, only=new)
             planes[new] = np.where(hidden.planes[new] >= 0, hidden.planes[new] + len(plane), -1)
             plane = np.concatenate([plane, hidden.plane])
@@ -214,15 +215,13 @@ def settled(past: Past, grid: Grid) -> State:
     return State(memory.tree, measured, data, seen.take(memory.current))
 
 
-def remember(made: Refinement, judge: Judge, causes: dict[str, str], rules: str, past: Past | None) -> Memory:
+def remember(made: Refinement, causes: dict[str, str], rules: str, past: Past | None) -> Memory:
     """Put together what the next bake may use.
 
     Parameters
     ----------
     made : Refinement
         A cell that has been refined.
-    judge : Judge
-        Its judge.
     causes : dict of str to str
         From `changes.causes`.
     rules : str
@@ -235,21 +234,21 @@ def remember(made: Refinement, judge: Judge, causes: dict[str, str], rules: str,
     Memory
         Without the digest of its files.
     """
-    state, scene, views = made.state, made.scene, judge.views if past is None else past.memory.views
-    paths = np.zeros((state.tree.size, len(views), 9), np.float32)
+    state, scene = made.state, made.scene
+    paths = np.zeros(made.unmoved.light.shape, np.float32)
     row = np.full(state.tree.size, -1) if past is None else _rows(state.tree, past.memory.tree)
     kept = (row >= 0) & (past.known[row] if past is not None else False)
     if past is not None:
         paths[kept] = past.pilot[row[kept]]
     new = take(made.unmoved, ~kept)
-    paths[~kept] = changes.pilot(scene, made.grid, new, views, made.target.effort)
+    paths[~kept] = changes.pilot(scene, made.grid, new, made.target.effort)
     current = np.zeros(sum(len(look.seen.at.key) for look in made.looks), bool)
     current[made.current] = True
     need = [
         (coords[value > 0], value[value > 0]) for coords, value in zip(made.outline.coords, made.need, strict=False)
     ]
     surfaces = changes.triangles_near(scene, made.grid, state.tree.cell)
-    own = made.unmoved, made.moved, paths, views, made.looks, current, need, made.asked
+    own = made.unmoved, made.moved, paths, made.looks, current, need, made.asked
     return Memory(
         state.tree, *own, state.data.planes, state.data.plane, *surfaces, scene.cache is not None, causes, rules
     )

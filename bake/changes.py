@@ -17,10 +17,10 @@ import numpy as np
 from ..tree.dualcells import CORNERS
 from ..tree.grid import Grid
 from ..tree.pairs import voxels_in
+from ..tree.topology import Topology
 from . import datapoints, receivers, snapshot_file
-from .blocks import BLOCK, Blocks, pool_keys, pool_level, pools, touch
+from .blocks import BLOCK, Blocks, around, pool_keys, pool_level, pools, touch
 from .gather import Effort, gather
-from .lamps import LUMINANCE
 from .measured import Measured, moved_light, positions, split, stack, take
 from .memory import Look, Memory, Moved, digest
 from .receivers import Receivers
@@ -29,7 +29,7 @@ from .sensors import HarmonicsSensor
 from .snapshot import LightKind, Snapshot
 from .sobol import scramble
 from .surfels import Surfels
-from .survey import Seen, trace
+from .survey import Judge, Seen, trace
 
 __all__ = ["Past", "causes", "compare", "pilot", "triangles_near"]
 
@@ -60,6 +60,7 @@ class Past:
     memory : Memory, where everything that is trusted has the light of today
     pilot : as in `Memory`, of the data points as `memory` has them now
     surfaces : Blocks, where other surfaces are, and nothing is known
+    beyond : Blocks, the same outside of the cell, as far as its data points may light them
     decide : Blocks, those and where the tree is to be decided on anew
     changed : bool, whether anything differs from what was stored
     kept : int, data points that were not measured again
@@ -68,6 +69,7 @@ class Past:
     memory: Memory
     pilot: np.ndarray
     surfaces: Blocks
+    beyond: Blocks
     decide: Blocks
     changed: bool
     kept: int
@@ -78,7 +80,7 @@ class Past:
         return ~touch(self.surfaces, self.memory.measured)
 
 
-def causes(snapshot: Snapshot, scene: Scene) -> dict[str, str]:
+def causes(snapshot: Snapshot, scene: Scene, judge: Judge) -> dict[str, str]:
     """Digest what the light of each transport depends on.
 
     Parameters
@@ -87,11 +89,13 @@ def causes(snapshot: Snapshot, scene: Scene) -> dict[str, str]:
         The scene, with the sky that is baked.
     scene : Scene
         The same, prepared.
+    judge : Judge
+        What errors are measured in.
 
     Returns
     -------
     dict of str to str
-        "matter" for all of them, "local", "sun", "sky".
+        "matter" for all of them, "local", "sun", "sky"; "judge" for decisions.
     """
     lights = snapshot.lights
     names = [field.name for field in dataclasses.fields(lights) if field.name != "names"]
@@ -101,6 +105,7 @@ def causes(snapshot: Snapshot, scene: Scene) -> dict[str, str]:
     matter = dataclasses.replace(snapshot, lights=bare, sky=black)
     return {
         "matter": snapshot_file.digest(matter),
+        "judge": digest(judge.views, judge.mean),
         "local": digest(*(getattr(lights, name)[lamps] for name in names)),
         "sun": digest(scene.model.suns.toward, scene.model.suns.diameter),
         "sky": digest(snapshot.sky if scene.model.sky == "fixed" else scene.model.sky),
@@ -133,7 +138,7 @@ def triangles_near(scene: Scene, grid: Grid, cell: tuple[int, int]) -> tuple[np.
     return scene.soup.corners[rows], ~scene.surfaces.transparent[rows]
 
 
-def pilot(scene: Scene, grid: Grid, measured: Measured, views: np.ndarray, effort: Effort) -> np.ndarray:
+def pilot(scene: Scene, grid: Grid, measured: Measured, effort: Effort) -> np.ndarray:
     """Measure light at data points by few paths.
 
     Parameters
@@ -144,26 +149,24 @@ def pilot(scene: Scene, grid: Grid, measured: Measured, views: np.ndarray, effor
         The lattice.
     measured : Measured
         Data points.
-    views : (v, functions, 3) float64 ndarray
-        What is looked at.
     effort : Effort
         As they were measured.
 
     Returns
     -------
-    (n, v, 9) float32 ndarray
-        Luminance; 0 where not valid.
+    (n, functions, 9, 3) float32 ndarray
+        Irradiance harmonics; 0 where not valid.
     """
-    out = np.zeros((len(measured.level), len(views), 9), np.float32)
+    out = np.zeros(measured.light.shape, np.float32)
     rows = np.flatnonzero(measured.valid)
-    if len(rows) and len(views):
+    if len(rows) and out.shape[1]:
         some = take(measured, rows)
         position = _places(grid, some).T.astype(np.float32)
         order = datapoints.morton_order(position)
         key = datapoints.keys(some.level, some.coords)[order]
         few = dataclasses.replace(effort, samples=min(PILOT, effort.samples))
-        found = stack(scene, gather(scene, HarmonicsSensor(), np.ascontiguousarray(position[:, order]), key, few))
-        out[rows[order]] = np.einsum("nfkc,vfc->nvk", found, views * LUMINANCE)
+        found = gather(scene, HarmonicsSensor(), np.ascontiguousarray(position[:, order]), key, few)
+        out[rows[order]] = stack(scene, found)
     return out
 
 
@@ -190,23 +193,28 @@ def compare(memory: Memory, scene: Scene, grid: Grid, now: dict[str, str], effor
     Past or None
         None where so much has changed that nothing is worth keeping.
     """
-    surfaces = _other_surfaces(memory, scene, grid)
-    if surfaces is None:
+    same_matter = now["matter"] == memory.causes["matter"]
+    others = _other_surfaces(memory, scene, grid, same_matter)
+    if others is None:
         return None
+    surfaces, beyond = others
     measured, known = memory.measured, ~touch(surfaces, memory.measured)
     columns = {name: rows[0] for name, rows in split(scene, np.arange(measured.light.shape[1])[None]).items()}
-    same_matter = now["matter"] == memory.causes["matter"]
     names = [name for name in columns if not (same_matter and now[name] == memory.causes[name])]
     paths = memory.pilot.copy()
     if names:
-        paths[known] = pilot(scene, grid, take(measured, known), memory.views, effort)
-    views = [list(columns).index(name) for name in names]
-    pooled, own = (change[:, views] for change in _relative_changes(grid, memory, paths, known))
+        paths[known] = pilot(scene, grid, take(measured, known), effort)
+    pooled, own = _relative_changes(grid, memory, paths, known, [columns[name] for name in names])
     bound = np.array([memory.bounds[name] for name in names])
-    wide, alone = known & (pooled > TOLERANCE * bound).any(axis=1), known & (own > bound).any(axis=1)
+    wide, alone = known & ~(pooled <= TOLERANCE * bound).all(axis=1), known & ~(own <= bound).all(axis=1)
+    for name in names:
+        if now[name] != memory.causes[name]:
+            alone |= known & _is_unseen(memory, paths, columns[name])
     stale = wide | alone
-    restless = pools(grid, take(measured, known & (pooled > DECIDE).any(axis=1)))
+    restless = pools(grid, take(measured, known & ~(pooled <= DECIDE).all(axis=1)))
     decide = Blocks([*surfaces.marks, *((int(pool_level(grid, level)), coords) for level, coords in restless)])
+    if now["judge"] != memory.causes["judge"]:
+        decide = Blocks([(0, measured.coords[measured.level == 0])])
     paths[~stale] = memory.pilot[~stale]
     number = np.concatenate([np.zeros(0, np.int64), *(columns[name] for name in names)])
     known_there = _Around(grid, take(measured, known & measured.valid), take(measured, wide), take(measured, alone))
@@ -217,7 +225,8 @@ def compare(memory: Memory, scene: Scene, grid: Grid, now: dict[str, str], effor
         moved=update.moved(memory, stale),
         looks=[update.look(look, known_there.rows(level, look.seen.at)) for level, look in enumerate(memory.looks)],
     )
-    return Past(memory, paths, surfaces, decide, bool(surfaces) or bool(stale.any()), int((known & ~stale).sum()))
+    changed = bool(surfaces) or bool(beyond) or bool(decide) or bool(stale.any())
+    return Past(memory, paths, surfaces, beyond, decide, changed, int((known & ~stale).sum()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,7 +249,7 @@ class _Update:
     def moved(self, memory: Memory, stale: np.ndarray) -> Moved:
         """Those in cracks."""
         moved, light = memory.moved, memory.moved.light.copy()
-        rows = np.flatnonzero(stale[moved.row])
+        rows = np.flatnonzero(stale[moved.row] | ~memory.measured.valid[moved.row])
         light[rows[:, None], self.columns] = self._light(memory.measured, moved.row[rows], moved.offset[rows])
         return dataclasses.replace(moved, light=light)
 
@@ -298,25 +307,48 @@ def _only(scene: Scene, names: list[str]) -> Scene:
     return dataclasses.replace(scene, model=part, cache=cache)
 
 
-def _other_surfaces(memory: Memory, scene: Scene, grid: Grid) -> Blocks | None:
+def _other_surfaces(memory: Memory, scene: Scene, grid: Grid, same_matter: bool) -> tuple[Blocks, Blocks] | None:
     """Where triangles are that are only here or only there, and data points that are placed or judged otherwise for
-    it; None for too many."""
+    them; the same close to the cell, outside; None for too many."""
+    if same_matter:
+        return Blocks([]), Blocks([])
     corners, opaque = triangles_near(scene, grid, memory.tree.cell)
     old, new = _names(memory.corners, memory.opaque), _names(corners, opaque)
     other = np.concatenate([memory.corners[~np.isin(old, new)], corners[~np.isin(new, old)]]).astype(np.float64)
-    if not len(other):
-        return Blocks([])
     level = min(BLOCK, grid.levels - 1)
     size = float(grid.voxel_size(level))
     box = np.stack([other.min(axis=1) - size, other.max(axis=1) + size], axis=1)
     box = np.unique(np.floor(box / size).astype(np.int64).reshape(-1, 6), axis=0).reshape(-1, 2, 3)
     if np.prod(box[:, 1] - box[:, 0] + 1.0, axis=1).sum() > MOST_BLOCKS:
         return None
-    blocks = np.unique(np.concatenate([coords for _, coords in voxels_in(box[:, 0], box[:, 1])]), axis=0)
-    count = round(grid.cell_size / size)
-    near = blocks[:, :2] // count == memory.tree.cell
-    marks = Blocks([(level, blocks[near.all(axis=1)])])
-    return Blocks([*marks.marks, *_misplaced(memory, scene, grid, ~touch(marks, memory.measured))])
+    parts = [np.zeros((0, 3), np.int64), *(coords for _, coords in voxels_in(box[:, 0], box[:, 1]))]
+    blocks = np.unique(np.concatenate(parts), axis=0)
+    inside = (blocks[:, :2] // round(grid.cell_size / size) == memory.tree.cell).all(axis=1)
+    marks, outside = Blocks([(level, blocks[inside])]), Blocks([(level, blocks[~inside])])
+    marks = Blocks([*marks.marks, *_misplaced(memory, scene, grid, ~touch(marks, memory.measured))])
+    return marks, outside if lights(outside, memory.tree, memory.measured).any() else Blocks([])
+
+
+def lights(surfaces: Blocks, tree: Topology, measured: Measured) -> np.ndarray:
+    """Say which data points of a cell light surfaces somewhere.
+
+    Parameters
+    ----------
+    surfaces : Blocks
+        Where the surfaces are.
+    tree : Topology
+        The cell.
+    measured : Measured
+        Its data points.
+
+    Returns
+    -------
+    (size,) bool ndarray
+        Those close by; of the first level only leaves, as others bring next to nothing.
+    """
+    is_leaf = np.arange(tree.size) >= len(tree.nodes)
+    is_leaf[: len(tree.nodes)] = tree.nodes["mask"] == 0
+    return ((measured.level > 0) | is_leaf) & around(surfaces, measured)
 
 
 def _misplaced(memory: Memory, scene: Scene, grid: Grid, known: np.ndarray) -> list[tuple[int, np.ndarray]]:
@@ -345,21 +377,30 @@ def _names(corners: np.ndarray, opaque: np.ndarray) -> np.ndarray:
 
 
 def _relative_changes(
-    grid: Grid, memory: Memory, paths: np.ndarray, known: np.ndarray
+    grid: Grid, memory: Memory, paths: np.ndarray, known: np.ndarray, columns: list[np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(size, views) how much light differs from then, relative to it, averaged over each pool, and by itself."""
-    measured, then = memory.measured, memory.pilot.astype(np.float64)
-    rows, out = np.flatnonzero(known & measured.valid), np.zeros((2, len(known), then.shape[1]))
-    if not (len(rows) and then.shape[1]):
+    """(size, transports) how much the light of some functions differs from then, relative to it, averaged over each
+    pool, and by itself; 0 where that is not known."""
+    measured, out = memory.measured, np.zeros((2, len(known), len(columns)))
+    rows = np.flatnonzero(known & measured.valid)
+    if not len(rows):
         return tuple(out)
-    light, off = then[rows], paths[rows] - then[rows]
-    least = DARK * _length(light).mean(axis=0)
     _, pool = np.unique(pool_keys(grid, take(measured, rows)), axis=0, return_inverse=True)
-    out[0, rows] = _ratio(*(_length(_mean_over(pool.reshape(-1), values)) for values in (off, light)), least)[
-        pool.reshape(-1)
-    ]
-    out[1, rows] = _ratio(_length(off), _length(light), least)
+    pool = pool.reshape(-1)
+    for number, functions in enumerate(columns):
+        light = memory.pilot[rows][:, functions].astype(np.float64)
+        off = paths[rows][:, functions] - light
+        least = DARK * _length(light).mean()
+        pooled = (_length(_mean_over(pool, values)) for values in (off, light))
+        out[0, rows, number] = _ratio(*pooled, least)[pool]
+        out[1, rows, number] = _ratio(_length(off), _length(light), least)
     return tuple(out)
+
+
+def _is_unseen(memory: Memory, paths: np.ndarray, functions: np.ndarray) -> np.ndarray:
+    """(size,) data points with light that few paths find neither then nor now: they say nothing about it."""
+    found = memory.pilot[:, functions].any(axis=(1, 2, 3)) | paths[:, functions].any(axis=(1, 2, 3))
+    return ~found & memory.measured.light[:, functions].any(axis=(1, 2, 3))
 
 
 def _mean_over(pool: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -370,12 +411,12 @@ def _mean_over(pool: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def _length(values: np.ndarray) -> np.ndarray:
-    """(n, views) of (n, views, 9) harmonics."""
-    return np.sqrt((values**2).sum(axis=2))
+    """(n,) of (n, functions, 9, 3) harmonics."""
+    return np.sqrt((values**2).sum(axis=(1, 2, 3)))
 
 
-def _ratio(off: np.ndarray, light: np.ndarray, least: np.ndarray) -> np.ndarray:
-    """(n, views) off over light; without any light every change is infinite."""
+def _ratio(off: np.ndarray, light: np.ndarray, least: float) -> np.ndarray:
+    """(n,) off over light; without any light every change is infinite."""
     scale = np.maximum(light, least)
     return np.divide(off, scale, out=np.where(off > 0, np.inf, 0.0), where=scale > 0)
 

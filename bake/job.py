@@ -149,8 +149,9 @@ def bake(
     effort = Effort(settings.samples, settings.bounces, settings.seed, threads)
     goal = Target(settings.error, settings.max_points, settings.dilation, effort, settings.receiver_samples)
     room = Room(TOGETHER)
-    history = _History(_rules(settings, scene, grid), changes.causes(effective, scene)) if incremental else None
-    work = _Work(scene, grid, place, settings, _judge(snapshot, settings, scene), goal, room, history)
+    judge = _judge(snapshot, settings, scene)
+    history = _History(_rules(settings, scene, grid), changes.causes(effective, scene, judge)) if incremental else None
+    work = _Work(scene, grid, place, settings, judge, goal, room, history)
     try:
         if early and place.taken:
             _look_early(work, wanted, progress)
@@ -407,8 +408,10 @@ def _bake_again(work: _Work, known: memory.Memory, show: Callable[[float], bool]
         return None
     if not past.changed and work.place.keep_cell(cell, known.content):
         work.kept[cell] = past.kept
+        found = folder.read_cell(work.place.target, cell).payloads
+        work.arriving[cell] = {name for name, payload in found.items() if payload.table.coefficient.any()}
         return known.tree
-    if not past.decide:
+    if not (past.decide or past.beyond):
         refined = settled(past, work.grid)
         made = dataclasses.replace(past.memory, pilot=past.pilot, causes=now)
     else:
@@ -416,7 +419,7 @@ def _bake_again(work: _Work, known: memory.Memory, show: Callable[[float], bool]
         again = Again(scene, found, work.judge, work.target, show, past)
         with work.room.hold(sum(len(coords) for coords in found.coords)):
             refined = again.run()
-        made = remember(again, work.judge, now, known.rules, past)
+        made = remember(again, now, known.rules, past)
     limit = work.settings.max_bytes
     size = _write(work, cell, refined, limit=limit)
     if limit and size > limit:
@@ -443,7 +446,7 @@ def _fill_cell(work: _Work, cell: tuple[int, int], found: Outline, show: Callabl
     if limit and size > limit:
         work.warnings.append(f"cell {_list([cell])} takes {size:,} bytes, {size - limit:,} more than --max-bytes")
     if work.history:
-        _keep(work, remember(made, work.judge, work.history.causes, work.history.rules, None))
+        _keep(work, remember(made, work.history.causes, work.history.rules, None))
     return made.state.tree
 
 

@@ -7,13 +7,14 @@ bake's; engines don't need it, and it can be deleted at any time.
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from ..tree import container
+from ..tree import container, validate
 from ..tree.container import FileError
 from ..tree.grid import Grid
 from ..tree.topology import Topology, is_terminal, link_blocks
@@ -27,6 +28,9 @@ FOLDER = "memory"
 """Where the files lie within the folder of a bake."""
 
 KIND, VERSION = "memory", 1
+
+AT = [("position", (3,)), ("normal", (3,)), ("area", ()), ("key", ()), ("front", ())]
+"""Fields of receivers, and what follows their number in an array's shape."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +65,7 @@ class Memory:
     tree : Topology
     measured : Measured, its data points before any was moved into a crack
     moved : Moved
-    pilot : (size, views, 9) float32, luminance by few paths at the same data points, as they were when `measured` was
-    views : (views, functions, 3) float64, of the judge that `pilot` is seen by
+    pilot : (size, functions, 9, 3) float32, light by few paths at the same data points, when `measured` was measured
     looks : list of Look, by level
     current : (n,) bool, which receivers of all looks were not replaced by those of finer levels
     need : list of (coords (k, 3) int64, value (k,) float64), by level: voxels that are to be subdivided
@@ -80,7 +83,6 @@ class Memory:
     measured: Measured
     moved: Moved
     pilot: np.ndarray
-    views: np.ndarray
     looks: list[Look]
     current: np.ndarray
     need: list[tuple[np.ndarray, np.ndarray]]
@@ -144,7 +146,7 @@ def save(memory: Memory, target: str | os.PathLike) -> int:
     for level, (coords, value) in enumerate(memory.need):
         arrays |= {f"need/{level}/coords": coords, f"need/{level}/value": value}
     arrays |= {f"asked/{level}": coords for level, coords in enumerate(memory.asked)}
-    for name in ("pilot", "views", "current", "planes", "plane", "corners", "opaque"):
+    for name in ("pilot", "current", "planes", "plane", "corners", "opaque"):
         arrays[name] = getattr(memory, name)
     counts = [len(memory.looks), len(memory.need), len(memory.asked)]
     meta = {"version": VERSION, "cell": list(tree.cell), "grid_min": list(tree.grid_min), "counts": counts}
@@ -177,7 +179,7 @@ def load(target: str | os.PathLike, cell: tuple[int, int], grid: Grid, rules: st
     """
     try:
         file = container.read(memory_path(target, cell), KIND)
-        if (file.meta["version"], file.meta["rules"]) != (VERSION, rules):
+        if (file.meta["version"], file.meta["rules"], tuple(file.meta["cell"])) != (VERSION, rules, tuple(cell)):
             return None
         return _memory(file, grid)
     except (OSError, FileError, KeyError, TypeError, ValueError):
@@ -204,9 +206,13 @@ def _memory(file: container.Container, grid: Grid) -> Memory:
     """A file's content; its checksums were right, so that only a program of another version can have left gaps."""
     meta, arrays = file.meta, file.arrays
     shape = tuple(meta["grid_shape"])
-    nodes = link_blocks(arrays["mask"], arrays["terminal"], int(np.prod(shape)))
+    if not 0 < math.prod(shape) <= len(arrays["mask"]):
+        raise ValueError("nodes are missing")
+    nodes = link_blocks(arrays["mask"], arrays["terminal"], math.prod(shape))
     numbers = meta["levels"], meta["left_out"], meta["dilated"]
     tree = Topology(tuple(meta["cell"]), tuple(meta["grid_min"]), shape, nodes, *numbers)
+    if validate.first_defect(tree):
+        raise ValueError("the tree is broken")
     measured = Measured(*tree.voxels(), *(arrays[f"measured/{name}"] for name in ("offset", "valid", "light")))
     moved = Moved(*(arrays[f"moved/{name}"] for name in ("row", "offset", "light")))
     looks = []
@@ -216,8 +222,44 @@ def _memory(file: container.Container, grid: Grid) -> Memory:
     need = [(arrays[f"need/{level}/coords"], arrays[f"need/{level}/value"]) for level in range(meta["counts"][1])]
     asked = [arrays[f"asked/{level}"] for level in range(meta["counts"][2])]
     own = (arrays[name] for name in ("planes", "plane", "corners", "opaque"))
-    parts = (measured, moved, arrays["pilot"], arrays["views"], looks, arrays["current"], need, asked, *own)
-    return Memory(tree, *parts, meta["cached"], meta["causes"], meta["rules"], meta["bounds"], meta["content"])
+    parts = (measured, moved, arrays["pilot"], looks, arrays["current"], need, asked, *own)
+    memory = Memory(tree, *parts, meta["cached"], meta["causes"], meta["rules"], meta["bounds"], meta["content"])
+    _check(memory)
+    return memory
+
+
+def _check(memory: Memory) -> None:
+    """Refuse what `changes` and `again` would stumble over, or take for unchanged."""
+    size, functions = memory.tree.size, memory.measured.light.shape[1]
+    light = (functions, 9, 3)
+    shapes = [
+        (memory.measured.light, (size, *light)),
+        (memory.measured.offset, (size, 3)),
+        (memory.measured.valid, (size,)),
+        (memory.pilot, (size, *light)),
+        (memory.moved.offset, (len(memory.moved.row), 3)),
+        (memory.moved.light, (len(memory.moved.row), *light)),
+        (memory.planes, (size, 3)),
+        (memory.plane, (len(memory.plane), 5)),
+        (memory.current, (sum(len(look.seen.at.key) for look in memory.looks),)),
+        (memory.corners, (len(memory.opaque), 3, 3)),
+        *((look.seen.light, (2, len(look.seen.at.key), functions, 3)) for look in memory.looks),
+        *(
+            (getattr(look.seen.at, name), (len(look.seen.at.key), *shape))
+            for look in memory.looks
+            for name, shape in AT
+        ),
+        *((coords, (len(value), 3)) for coords, value in memory.need),
+    ]
+    if any(array.shape != shape for array, shape in shapes):
+        raise ValueError("arrays do not fit together")
+    if any(not np.isfinite(array).all() for array, _ in shapes if array.dtype.kind == "f"):
+        raise ValueError("a number is not finite")
+    for row, end in ((memory.moved.row, size), (memory.planes, len(memory.plane))):
+        if len(row) and not (row.min() >= -1 and row.max() < end):
+            raise ValueError("a row does not exist")
+    if not all(isinstance(part, dict) for part in (memory.causes, memory.bounds)):
+        raise ValueError("causes or bounds are missing")
 
 
 def digest(*parts: object) -> str:

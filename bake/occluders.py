@@ -157,9 +157,12 @@ class _Slots:
 class _Task:
     """Everything that the choice reads: pairs and their worth, candidates, widths."""
 
-    def __init__(self, scene: Scene, data: interpolate.DataPoints, receivers: Receivers, pairs: Pairs, only) -> None:
+    def __init__(
+        self, scene: Scene, data: interpolate.DataPoints, receivers: Receivers, pairs: Pairs, only: np.ndarray | None
+    ) -> None:
         self.data, self.place = data, receivers.position
-        self.lit = np.bincount(pairs.receiver, pairs.weight * pairs.visible, len(self.place))
+        let = 1.0 if only is None else np.where(only[pairs.point], 1.0, _let_through(data, pairs, self.place))
+        self.lit = np.bincount(pairs.receiver, pairs.weight * pairs.visible * let, len(self.place))
         self.own = _within(data.boxes, self.place)
         chosen = slice(None) if only is None else only[pairs.point]
         self.value = _values(pairs, receivers.area.astype(np.float64))[chosen]
@@ -262,6 +265,18 @@ def _values(pairs: Pairs, area: np.ndarray) -> np.ndarray:
     part *= pairs.weight
     part[pairs.visible] *= -LOSS
     return part
+
+
+def _let_through(data: interpolate.DataPoints, pairs: Pairs, place: np.ndarray) -> np.ndarray:
+    """(m,) what the planes that data points have leave of pairs."""
+    out = np.ones(len(pairs.point))
+    for slot in range(data.planes.shape[1]):
+        row = data.planes[pairs.point, slot]
+        has = np.flatnonzero(row >= 0)
+        plane = data.plane[row[has]]
+        height = (plane[:, :3] * place[pairs.receiver[has]]).sum(axis=1) - plane[:, 3]
+        out[has] *= np.clip(1 + height / plane[:, 4], 0, 1)
+    return out
 
 
 def _falloff(finest: float, cell: float) -> Falloff:

@@ -259,7 +259,10 @@ class Place:
         if folder.digest_of_cell(found) != content:
             return False
         with self._stage() as staging:
-            folder.copy_cell(self.target, staging, cell, self.identity)
+            try:
+                folder.copy_cell(self.target, staging, cell, self.identity)
+            except (OSError, container.FileError):
+                return False  # another process has replaced it
             self._put(staging, cell)
         return True
 

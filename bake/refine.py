@@ -256,8 +256,7 @@ class Refinement:
         return np.arange(len(at.key))
 
     def _hide(self, at: Receivers) -> None:
-        """Planes for all data points, as some receivers see them: those with light on the way, as they are there; in
-        the end denser ones on all surfaces that the cell may light, those of other cells too."""
+        """Planes for all data points, as receivers with light see them, which are there anyway."""
         parallel.check()
         at = at.take(self._near(at))
         hidden = occluders.fit(self.scene, self.state.data, at, self.target.effort.threads)

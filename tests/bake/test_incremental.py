@@ -16,7 +16,7 @@ from gi_volumes.bake.refine import Refinement, Target
 from gi_volumes.bake.scene import prepare
 from gi_volumes.bake.settings import Settings, choose_grid, model
 from gi_volumes.bake.snapshot import Channel, LightKind, Material
-from gi_volumes.tree import folder, world
+from gi_volumes.tree import container, folder, world
 from gi_volumes.tree.outline import outline
 
 SETTINGS = Settings(samples=64, bounces=4, finest=0.5, error=0.1)
@@ -111,7 +111,8 @@ def test_a_bake_that_remembers_is_the_bake_that_does_not(first, tmp_path):
     assert all(equal(arrays(first, cell), arrays(tmp_path, cell)) for cell in CELLS)
 
 
-def test_what_is_the_same_is_copied(first, again):
+def test_what_is_the_same_is_copied(first, again, monkeypatch):
+    monkeypatch.setattr(job, "_write", None)
     target, outcome = again(house(lamp=1 + 1e-6))
     assert outcome.kept == outcome.data_points
     assert all(equal(arrays(first, cell), arrays(target, cell)) for cell in CELLS)
@@ -229,7 +230,8 @@ def test_a_settled_cell_is_the_cell_that_was_refined(first):
     known = memory.load(first, (0, 0), grid, rules)
     snapshot, light = model(house(), SETTINGS)
     scene = prepare(snapshot, light)
-    past = changes.compare(known, scene, grid, changes.causes(snapshot, scene), Effort(64, 4, 0, 1), 32)
+    causes = changes.causes(snapshot, scene, job._judge(snapshot, SETTINGS, scene))
+    past = changes.compare(known, scene, grid, causes, Effort(64, 4, 0, 1), 32)
     assert not past.changed
     assert not past.decide
     state = settled(past, grid)
@@ -250,8 +252,8 @@ def test_deciding_anew_where_nothing_has_changed_gives_the_same_state(error):
     target = Target(error, 65535, "partial", effort, 32)
     made = Refinement(scene, cell, judge, target, None)
     truth = made.run()
-    causes = changes.causes(snapshot, scene)
-    known = job.remember(made, judge, causes, "rules", None)
+    causes = changes.causes(snapshot, scene, judge)
+    known = job.remember(made, causes, "rules", None)
     past = changes.compare(known, scene, grid, causes, effort, 32)
     everything = Blocks([(0, truth.tree.voxels()[1][: truth.tree.grid_count])])
     past = dataclasses.replace(past, decide=everything)
@@ -261,6 +263,123 @@ def test_deciding_anew_where_nothing_has_changed_gives_the_same_state(error):
     assert np.array_equal(found.measured.offset, truth.measured.offset)
     assert np.array_equal(np.sort(found.seen.at.key), np.sort(truth.seen.at.key))
     assert np.array_equal(found.data.plane[found.data.planes], truth.data.plane[truth.data.planes])
+
+
+def simple(lamp=(30, 0, 0), suns=((1, 0, 1), (-1, 0, 1)), strength=(3.0, 3.0), walls=(), low=0.5):
+    """A hall with a slit in its roof."""
+    parts = [
+        (build_scenes.box((low, 0.5, 0.1), (low + 31.0, 6.0, 4.1), inward=True)[:10], Material("hall")),
+        (
+            build_scenes.quad((low, 0.5, 4.1), (low, 5.0, 4.1), (low + 31, 5.0, 4.1), (low + 31, 0.5, 4.1)),
+            Material("lid"),
+        ),
+        *walls,
+    ]
+    rows = [{"position": (low + 7.5, 4.0, 2.4), "strength": np.array(lamp)}]
+    for direction, irradiance in zip(suns, strength, strict=True):
+        frame = build_scenes.sun_frame(direction)
+        rows.append({"kind": LightKind.SUN, "frame": frame, "strength": (irradiance,) * 3})
+    return build_scenes.snapshot(parts, build_scenes.lamps(*rows), (0.1, 0.1, 0.1))
+
+
+def both(before, after, tmp_path, settings=SETTINGS):
+    """A bake again, and a whole one."""
+    job.bake(before, tmp_path / "again", settings, threads=2, incremental=True)
+    outcome = job.bake(after, tmp_path / "again", settings, threads=2, incremental=True)
+    job.bake(after, tmp_path / "whole", settings, threads=2)
+    return tmp_path / "again", tmp_path / "whole", outcome
+
+
+def test_another_hue_of_the_same_luminance_is_seen(tmp_path):
+    green = (0, 30 * 0.2126 / 0.7152, 0)
+    again, whole, _ = both(simple(), simple(lamp=green), tmp_path)
+    at = np.array([[8.0, 3.0, 0.1]]), np.array([[0.0, 0.0, 1.0]])
+    found, truth = (world.load(target).irradiance(*at, transport="local")[0] for target in (again, whole))
+    assert found[0] < 0.01 * found[1]
+    assert found == pytest.approx(truth, rel=0.05, abs=1e-3)
+
+
+def test_suns_that_change_places_are_seen(tmp_path):
+    again, whole, _ = both(simple(), simple(suns=((-1, 0, 1), (1, 0, 1))), tmp_path)
+    for number in range(2):
+        found, truth = (
+            folder.read_cell(target, (0, 0)).payloads["sun"].values()[:, number] for target in (again, whole)
+        )
+        assert np.sqrt(((found - truth) ** 2).mean()) < 0.2 * np.sqrt((truth**2).mean())
+
+
+def test_another_strength_of_the_sun_decides_on_the_tree_anew(tmp_path):
+    again, whole, _ = both(simple(strength=(1e-4, 1e-4)), simple(strength=(100.0, 100.0)), tmp_path)
+    found, truth = (folder.read_cell(target, (0, 0)) for target in (again, whole))
+    assert np.array_equal(found.topology.nodes, truth.topology.nodes)
+    assert found.planes.shade == pytest.approx(truth.planes.shade, abs=0.05)
+
+
+def test_a_wall_just_beyond_the_border_hides_light(tmp_path):
+    wall = (build_scenes.box((129.3, 0.4, 0.0), (129.6, 6.1, 4.2)), Material("wall"))
+    settings = dataclasses.replace(SETTINGS, error=0.2)
+    lit, dark = simple(low=112.5), simple(low=112.5, walls=(wall,))
+    again, whole, _ = both(lit, dark, tmp_path, settings)
+    x, y = np.meshgrid(np.linspace(129.65, 131.0, 20), np.linspace(1.0, 5.5, 20))
+    points = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.1)])
+    up = np.tile([0.0, 0.0, 1.0], (len(points), 1))
+    found, truth = (world.load(target).irradiance(points, up, transport="local").mean() for target in (again, whole))
+    before = world.load(whole).irradiance([[120.0, 3.0, 0.1]], [[0.0, 0.0, 1.0]], transport="local").mean()
+    assert abs(found - truth) < 0.003 * before
+
+
+def test_the_cache_of_a_cell_is_used_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(job, "WORTH", 0)
+    settings = dataclasses.replace(SETTINGS, method="cache", bounces=32)
+    again, whole, outcome = both(house(), house(moved(2.0), other=0.5), tmp_path, settings)
+    off = np.sqrt((differences(again, whole) ** 2).mean())
+    assert off < settings.error / 2
+    assert 0 < outcome.kept < outcome.data_points
+    assert outcome.checked[0]["places"] > 0
+
+
+def spoiled(file, what: str) -> tuple[dict, dict]:
+    """Arrays and header of a memory that another program has written."""
+    arrays, meta = dict(file.arrays), dict(file.meta)
+    if what == "cell":
+        meta["cell"] = [1, 0]
+    elif what == "pilot":
+        arrays["pilot"] = np.full_like(arrays["pilot"], np.nan)
+    elif what == "short":
+        arrays["measured/light"] = arrays["measured/light"][:-1]
+    elif what == "planes":
+        arrays["planes"] = np.full_like(arrays["planes"], 1000)
+    elif what == "huge":
+        meta["grid_shape"] = [100_000, 100_000, 10]
+    elif what == "negative":
+        meta["grid_shape"] = [-1, -1, meta["grid_shape"][2]]
+    elif what == "causes":
+        meta["causes"] = [1]
+    return arrays, meta
+
+
+@pytest.mark.parametrize("what", ["cell", "pilot", "short", "planes", "huge", "negative", "causes"])
+def test_a_memory_that_does_not_fit_is_not_used(first, tmp_path, what):
+    copy(first, tmp_path)
+    path = memory.memory_path(tmp_path, (0, 0))
+    arrays, meta = spoiled(container.read(path), what)
+    container.write(path, "memory", arrays, meta)
+    assert memory.load(tmp_path, (0, 0), grid_of(first), rules_of(first)) is None
+    outcome = job.bake(house(lamp=1 + 1e-6), tmp_path, SETTINGS, threads=2, incremental=True)
+    assert outcome.kept == outcome.data_points - folder.read_cell(first, (0, 0)).topology.size
+
+
+def test_a_re_bake_that_was_stopped_goes_on(first, tmp_path, monkeypatch):
+    copy(first, tmp_path)
+    there = house(moved(2.0), other=0.5)
+    job.bake(there, tmp_path, SETTINGS, [(1, 0)], threads=1, incremental=True)
+    assert memory.memory_path(tmp_path, (0, 0)).exists()
+    outcome = job.bake(there, tmp_path, SETTINGS, threads=1, incremental=True)
+    assert outcome.kept > 0
+    job.bake(there, tmp_path / "at once", SETTINGS, threads=1, incremental=True)
+    copy(first, tmp_path / "other")
+    job.bake(there, tmp_path / "other", SETTINGS, threads=1, incremental=True)
+    assert cells_only(tmp_path) == cells_only(tmp_path / "other")
 
 
 def naive(marks, level, coords) -> list[bool]:
