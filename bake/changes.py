@@ -398,9 +398,10 @@ def _relative_changes(
 
 
 def _is_unseen(memory: Memory, paths: np.ndarray, functions: np.ndarray) -> np.ndarray:
-    """(size,) data points with light that few paths find neither then nor now: they say nothing about it."""
+    """(size,) data points with light that few paths find neither then nor now, so that they say nothing about it."""
     found = memory.pilot[:, functions].any(axis=(1, 2, 3)) | paths[:, functions].any(axis=(1, 2, 3))
-    return ~found & memory.measured.light[:, functions].any(axis=(1, 2, 3))
+    light = _length(memory.measured.light[:, functions])
+    return ~found & (light > DARK * light.mean())
 
 
 def _mean_over(pool: np.ndarray, values: np.ndarray) -> np.ndarray:
