@@ -16,7 +16,7 @@ from ..tree.outline import Outline
 from ..tree.region import finder
 from ..tree.topology import Topology
 from . import changes, judges, occluders, parallel, receivers
-from .blocks import BLOCK, Blocks, beside, touch, voxels_of
+from .blocks import BLOCK, Blocks, by_level, voxels_of
 from .changes import Past
 from .measured import Measured, join, move, take
 from .memory import Memory
@@ -47,7 +47,7 @@ class Again(Refinement):
 
     def __init__(self, scene: Scene, outline: Outline, judge: Judge, target: Target, progress, past: Past) -> None:
         super().__init__(scene, outline, judge, target, progress)
-        self.past, self.memory, self.level = past, past.memory, 0
+        self.past, self.memory = past, past.memory
         self.kept = take(past.memory.measured, past.known)
         self.looked = [receivers.among(look.coords) for look in past.memory.looks]
 
@@ -60,7 +60,6 @@ class Again(Refinement):
 
     def _found(self, level: int) -> Seen:
         """Those that are known; others in voxels that are new or have other surfaces."""
-        self.level = level
         of_level, coords = self.state.tree.voxels()
         coords = coords[of_level == level]
         known = self._is_looked(level, coords) & ~self.past.surfaces.touch(level, coords)
@@ -79,13 +78,18 @@ class Again(Refinement):
         new = (Atlas([self.state.tree]).find(level, coords) >= 0) & ~self._is_looked(level, coords)
         return self.past.decide.touch(level, coords) | new
 
+    def _is_open(self, at: Receivers) -> np.ndarray:
+        """(n,) which receivers lie in such voxels of the level that was looked at last."""
+        level = len(self.looks) - 1
+        return self._open(level, self._voxels(level, at.position))
+
     def _voxels(self, level: int, position: np.ndarray) -> np.ndarray:
         """(n, 3) voxels that hold positions."""
         return np.floor(position / float(self.grid.voxel_size(level))).astype(np.int64)
 
     def _near(self, at: Receivers) -> np.ndarray:
         """Receivers in voxels to be decided on, and those that share data points with them."""
-        chosen = self._open(self.level, self._voxels(self.level, at.position))
+        chosen = self._is_open(at)
         row, weight = interpolate.weigh(self.state.data, at.position, at.normal)
         counts = weight > SHARE * weight.sum(axis=1, keepdims=True)
         for _ in range(RINGS):
@@ -112,7 +116,7 @@ class Again(Refinement):
 
     def _wrong(self) -> np.ndarray:
         """Only where it is to be decided."""
-        return super()._wrong() & self._open(self.level, self._voxels(self.level, self.state.seen.at.position))
+        return super()._wrong() & self._is_open(self.state.seen.at)
 
     def _fill_cracks(self) -> tuple[np.ndarray, np.ndarray]:
         """With those that were moved before, where nothing has changed."""
@@ -137,13 +141,13 @@ class Again(Refinement):
         """(m,) rows in the tree of the voxels whose data points were moved before; -1 where it is to be decided."""
         some = take(self.memory.measured, self.memory.moved.row)
         row = Atlas([self.state.tree]).find(some.level.astype(np.int64), some.coords)
-        return np.where(touch(self.past.decide, some), -1, row)
+        return np.where(by_level(self.past.decide.touch, some), -1, row)
 
     def _hide_finally(self) -> None:
         """Planes of before where neither tree nor surfaces have changed, nor data points been moved; others anew."""
         parallel.check()
         tree, measured, threads = self.state.tree, self.state.measured, self.target.effort.threads
-        new = beside(self._changed_voxels(), measured) | touch(self.past.surfaces, measured)
+        new = by_level(self._changed_voxels().beside, measured) | by_level(self.past.surfaces.touch, measured)
         for blocks in (self.past.surfaces, self.past.beyond):
             new |= changes.lights(blocks, tree, measured)
         row = _rows(tree, self.memory.tree)
@@ -170,9 +174,8 @@ class Again(Refinement):
         """Receivers that some data points may light: as dense as in a first bake around fine ones and leaves, around
         other coarse ones those whose light is traced."""
         tree, measured, at = self.state.tree, self.state.measured, self.state.seen.at
-        coarse = (np.arange(tree.size) < len(tree.nodes)) & (measured.level < BLOCK)
-        coarse[: len(tree.nodes)] &= tree.nodes["mask"] != 0
-        close = beside(voxels_of(take(measured, new & ~coarse)), measured)
+        coarse = (measured.level < BLOCK) & ~tree.leaves
+        close = by_level(voxels_of(take(measured, new & ~coarse)).beside, measured)
         dense = judges.around(self.scene, self.grid, tree, self.target.effort.threads, close)
         others, seen = voxels_of(take(measured, new & coarse)), np.zeros(len(at.key), bool)
         for level in range(BLOCK):

@@ -13,11 +13,10 @@ from ..tree.grid import BRANCH, Grid
 from . import receivers
 from .measured import Measured
 
-__all__ = ["BLOCK", "Blocks", "around", "beside", "pool_keys", "pool_level", "pools", "touch", "voxels_of"]
+__all__ = ["BLOCK", "Blocks", "by_level", "pool_keys", "pool_level", "pools", "voxels_of"]
 
 BLOCK = 2
 """Level of the voxels in which surfaces are compared: 0.5 m at human scale."""
-
 
 STEP = BRANCH.bit_length() - 1
 """Binary digits of a coordinate that one level adds."""
@@ -172,62 +171,21 @@ def voxels_of(measured: Measured) -> Blocks:
     return Blocks([(int(level), measured.coords[measured.level == level]) for level in np.unique(measured.level)])
 
 
-def touch(blocks: Blocks, measured: Measured) -> np.ndarray:
-    """Say which data points' voxels are, hold or lie in some blocks.
+def by_level(judge: Callable[[int, np.ndarray], np.ndarray], measured: Measured) -> np.ndarray:
+    """Ask something about the voxels of data points.
 
     Parameters
     ----------
-    blocks : Blocks
-        Voxels.
+    judge : callable
+        A method of `Blocks`.
     measured : Measured
         n data points.
 
     Returns
     -------
     (n,) bool ndarray
-        Of each.
+        What it says of each.
     """
-    return _by_level(blocks.touch, measured)
-
-
-def around(blocks: Blocks, measured: Measured) -> np.ndarray:
-    """Say which data points' voxels or their neighbours are, hold or lie in some blocks.
-
-    Parameters
-    ----------
-    blocks : Blocks
-        Voxels.
-    measured : Measured
-        n data points.
-
-    Returns
-    -------
-    (n,) bool ndarray
-        Of each.
-    """
-    return _by_level(blocks.around, measured)
-
-
-def beside(blocks: Blocks, measured: Measured) -> np.ndarray:
-    """Say which data points' voxels or their neighbours are among some blocks.
-
-    Parameters
-    ----------
-    blocks : Blocks
-        Voxels.
-    measured : Measured
-        n data points.
-
-    Returns
-    -------
-    (n,) bool ndarray
-        Of each.
-    """
-    return _by_level(blocks.beside, measured)
-
-
-def _by_level(judge: Callable[[int, np.ndarray], np.ndarray], measured: Measured) -> np.ndarray:
-    """(n,) what is said of the voxels of each level."""
     out = np.zeros(len(measured.level), bool)
     for level in np.unique(measured.level):
         rows = np.flatnonzero(measured.level == level)

@@ -19,7 +19,7 @@ from ..tree.grid import Grid
 from ..tree.pairs import voxels_in
 from ..tree.topology import Topology
 from . import datapoints, receivers, snapshot_file
-from .blocks import BLOCK, Blocks, around, pool_keys, pool_level, pools, touch
+from .blocks import BLOCK, Blocks, by_level, pool_keys, pool_level, pools
 from .gather import Effort, gather
 from .measured import Measured, moved_light, positions, split, stack, take
 from .memory import Look, Memory, Moved, digest
@@ -77,7 +77,7 @@ class Past:
     @cached_property
     def known(self) -> np.ndarray:
         """(size,) bool, data points that need not be measured."""
-        return ~touch(self.surfaces, self.memory.measured)
+        return ~by_level(self.surfaces.touch, self.memory.measured)
 
 
 def causes(snapshot: Snapshot, scene: Scene, judge: Judge) -> dict[str, str]:
@@ -198,7 +198,7 @@ def compare(memory: Memory, scene: Scene, grid: Grid, now: dict[str, str], effor
     if others is None:
         return None
     surfaces, beyond = others
-    measured, known = memory.measured, ~touch(surfaces, memory.measured)
+    measured, known = memory.measured, ~by_level(surfaces.touch, memory.measured)
     columns = {name: rows[0] for name, rows in split(scene, np.arange(measured.light.shape[1])[None]).items()}
     names = [name for name in columns if not (same_matter and now[name] == memory.causes[name])]
     paths = memory.pilot.copy()
@@ -325,7 +325,7 @@ def _other_surfaces(memory: Memory, scene: Scene, grid: Grid, same_matter: bool)
     blocks = np.unique(np.concatenate(parts), axis=0)
     inside = (blocks[:, :2] // round(grid.cell_size / size) == memory.tree.cell).all(axis=1)
     marks, outside = Blocks([(level, blocks[inside])]), Blocks([(level, blocks[~inside])])
-    marks = Blocks([*marks.marks, *_misplaced(memory, scene, grid, ~touch(marks, memory.measured))])
+    marks = Blocks([*marks.marks, *_misplaced(memory, scene, grid, ~by_level(marks.touch, memory.measured))])
     return marks, outside if lights(outside, memory.tree, memory.measured).any() else Blocks([])
 
 
@@ -346,9 +346,7 @@ def lights(surfaces: Blocks, tree: Topology, measured: Measured) -> np.ndarray:
     (size,) bool ndarray
         Those close by; of the first level only leaves, as others bring next to nothing.
     """
-    is_leaf = np.arange(tree.size) >= len(tree.nodes)
-    is_leaf[: len(tree.nodes)] = tree.nodes["mask"] == 0
-    return ((measured.level > 0) | is_leaf) & around(surfaces, measured)
+    return ((measured.level > 0) | tree.leaves) & by_level(surfaces.around, measured)
 
 
 def _misplaced(memory: Memory, scene: Scene, grid: Grid, known: np.ndarray) -> list[tuple[int, np.ndarray]]:

@@ -406,10 +406,10 @@ def _bake_again(work: _Work, known: memory.Memory, show: Callable[[float], bool]
     past = changes.compare(known, scene, work.grid, now, effort, samples)
     if past is None:
         return None
-    if not past.changed and work.place.keep_cell(cell, known.content):
+    copied = None if past.changed else work.place.keep_cell(cell, known.content)
+    if copied:
         work.kept[cell] = past.kept
-        found = folder.read_cell(work.place.target, cell).payloads
-        work.arriving[cell] = {name for name, payload in found.items() if payload.table.coefficient.any()}
+        work.arriving[cell] = {name for name, part in copied.payloads.items() if part.table.coefficient.any()}
         return known.tree
     if not (past.decide or past.beyond):
         refined = settled(past, work.grid)

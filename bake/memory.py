@@ -7,7 +7,6 @@ bake's; engines don't need it, and it can be deleted at any time.
 from __future__ import annotations
 
 import hashlib
-import math
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,11 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from ..tree import container, validate
+from ..tree.cells import tree_from, tree_parts
 from ..tree.container import FileError
 from ..tree.grid import Grid
-from ..tree.topology import Topology, is_terminal, link_blocks
+from ..tree.topology import Topology
 from .measured import Measured
-from .receivers import FIELDS, Receivers
+from .receivers import FIELDS, Receivers, none
 from .survey import Seen
 
 __all__ = ["FOLDER", "Look", "Memory", "Moved", "digest", "files", "load", "memory_path", "save"]
@@ -28,9 +28,6 @@ FOLDER = "memory"
 """Where the files lie within the folder of a bake."""
 
 KIND, VERSION = "memory", 1
-
-AT = [("position", (3,)), ("normal", (3,)), ("area", ()), ("key", ()), ("front", ())]
-"""Fields of receivers, and what follows their number in an array's shape."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +134,7 @@ def save(memory: Memory, target: str | os.PathLike) -> int:
         The file cannot be written.
     """
     tree, moved = memory.tree, memory.moved
-    arrays = {"mask": tree.nodes["mask"], "terminal": is_terminal(tree.nodes)}
+    arrays, meta = tree_parts(tree)
     arrays |= {f"measured/{name}": getattr(memory.measured, name) for name in ("offset", "valid", "light")}
     arrays |= {f"moved/{name}": getattr(moved, name) for name in ("row", "offset", "light")}
     for level, look in enumerate(memory.looks):
@@ -149,10 +146,8 @@ def save(memory: Memory, target: str | os.PathLike) -> int:
     for name in ("pilot", "current", "planes", "plane", "corners", "opaque"):
         arrays[name] = getattr(memory, name)
     counts = [len(memory.looks), len(memory.need), len(memory.asked)]
-    meta = {"version": VERSION, "cell": list(tree.cell), "grid_min": list(tree.grid_min), "counts": counts}
-    meta |= {"grid_shape": list(tree.grid_shape), "levels": tree.levels, "left_out": tree.left_out}
-    meta |= {"dilated": tree.dilated, "causes": memory.causes, "rules": memory.rules, "content": memory.content}
-    meta |= {"cached": memory.cached, "bounds": memory.bounds}
+    meta |= {"version": VERSION, "counts": counts}
+    meta |= {name: getattr(memory, name) for name in ("cached", "causes", "rules", "bounds", "content")}
     path = memory_path(target, tree.cell)
     path.parent.mkdir(exist_ok=True)
     return container.write(path, KIND, arrays, meta)
@@ -205,12 +200,7 @@ def files(target: str | os.PathLike) -> list[Path]:
 def _memory(file: container.Container, grid: Grid) -> Memory:
     """A file's content; its checksums were right, so that only a program of another version can have left gaps."""
     meta, arrays = file.meta, file.arrays
-    shape = tuple(meta["grid_shape"])
-    if not 0 < math.prod(shape) <= len(arrays["mask"]):
-        raise ValueError("nodes are missing")
-    nodes = link_blocks(arrays["mask"], arrays["terminal"], math.prod(shape))
-    numbers = meta["levels"], meta["left_out"], meta["dilated"]
-    tree = Topology(tuple(meta["cell"]), tuple(meta["grid_min"]), shape, nodes, *numbers)
+    tree = tree_from(arrays, meta)
     if validate.first_defect(tree):
         raise ValueError("the tree is broken")
     measured = Measured(*tree.voxels(), *(arrays[f"measured/{name}"] for name in ("offset", "valid", "light")))
@@ -245,9 +235,9 @@ def _check(memory: Memory) -> None:
         (memory.corners, (len(memory.opaque), 3, 3)),
         *((look.seen.light, (2, len(look.seen.at.key), functions, 3)) for look in memory.looks),
         *(
-            (getattr(look.seen.at, name), (len(look.seen.at.key), *shape))
+            (getattr(look.seen.at, name), (len(look.seen.at.key), *getattr(none(), name).shape[1:]))
             for look in memory.looks
-            for name, shape in AT
+            for name in FIELDS
         ),
         *((coords, (len(value), 3)) for coords, value in memory.need),
     ]

@@ -230,7 +230,7 @@ class Place:
             self._put(staging, tree.cell)
         return size
 
-    def keep_cell(self, cell: tuple[int, int], content: str) -> bool:
+    def keep_cell(self, cell: tuple[int, int], content: str) -> folder.Cell | None:
         """Take over a cell of another bake as it is.
 
         Parameters
@@ -242,8 +242,8 @@ class Place:
 
         Returns
         -------
-        bool
-            Whether its files are there, whole, and hold that.
+        Cell or None
+            The cell; None where its files are not there, not whole, or hold something else.
 
         Raises
         ------
@@ -255,16 +255,16 @@ class Place:
         try:
             found = folder.read_cell(self.target, cell)
         except (OSError, container.FileError):
-            return False
+            return None
         if folder.digest_of_cell(found) != content:
-            return False
+            return None
         with self._stage() as staging:
             try:
                 folder.copy_cell(self.target, staging, cell, self.identity)
             except (OSError, container.FileError):
-                return False  # another process has replaced it
+                return None  # another process has replaced it
             self._put(staging, cell)
-        return True
+        return found
 
     def list_cells(self) -> list[dict]:
         """List the cells that are there in `world.json`.

@@ -257,16 +257,16 @@ class Refinement:
 
     def _hide(self, at: Receivers) -> None:
         """Planes for all data points, as receivers with light see them, which are there anyway."""
-        parallel.check()
-        at = at.take(self._near(at))
-        hidden = occluders.fit(self.scene, self.state.data, at, self.target.effort.threads)
-        self._set_planes(hidden.planes, hidden.plane)
+        self._fit_planes(at.take(self._near(at)))
 
     def _hide_finally(self) -> None:
         """Planes for all data points, as dense receivers on all surfaces see them that the cell may light, those of
         other cells too."""
+        self._fit_planes(judges.around(self.scene, self.grid, self.state.tree, self.target.effort.threads))
+
+    def _fit_planes(self, at: Receivers) -> None:
+        """Planes as some receivers see the data points."""
         parallel.check()
-        at = judges.around(self.scene, self.grid, self.state.tree, self.target.effort.threads)
         hidden = occluders.fit(self.scene, self.state.data, at, self.target.effort.threads)
         self._set_planes(hidden.planes, hidden.plane)
 

@@ -36,6 +36,8 @@ __all__ = [
     "read_cell",
     "read_tree",
     "topology_hash",
+    "tree_from",
+    "tree_parts",
     "write_cell",
 ]
 
@@ -156,11 +158,61 @@ def write_cell(
             path.unlink(missing_ok=True)
     listed = {name: describe_file(cell_path(folder, cell, name)) for name in sizes}
     header = {**meta, **common, "files": listed, "data_points": size, "valid_points": int(valid.sum())}
-    header |= {"grid_min": list(topology.grid_min), "grid_shape": list(topology.grid_shape)}
-    header |= {"levels": topology.levels, "left_out": topology.left_out, "dilated": topology.dilated}
-    nodes = {"mask": topology.nodes["mask"], "terminal": is_terminal(topology.nodes)}
-    sizes[TREE] = container.write(cell_path(folder, cell, TREE), TREE, nodes, header)
+    nodes, shape = tree_parts(topology)
+    sizes[TREE] = container.write(cell_path(folder, cell, TREE), TREE, nodes, header | shape)
     return sizes
+
+
+def tree_parts(topology: Topology) -> tuple[dict[str, np.ndarray], dict]:
+    """Take a tree apart for a file.
+
+    Parameters
+    ----------
+    topology : Topology
+        The tree.
+
+    Returns
+    -------
+    arrays : dict of str to ndarray
+        What `tree_from` needs.
+    meta : dict
+        Likewise, of the header.
+    """
+    meta = {"cell": list(topology.cell), "grid_min": list(topology.grid_min), "grid_shape": list(topology.grid_shape)}
+    meta |= {"levels": topology.levels, "left_out": topology.left_out, "dilated": topology.dilated}
+    return {"mask": topology.nodes["mask"], "terminal": is_terminal(topology.nodes)}, meta
+
+
+def tree_from(arrays: dict[str, np.ndarray], meta: dict) -> Topology:
+    """Put a tree together again; nothing is allocated on the word of a file.
+
+    Parameters
+    ----------
+    arrays : dict of str to ndarray
+        As from `tree_parts`, among others.
+    meta : dict
+        Likewise.
+
+    Returns
+    -------
+    Topology
+        The tree, whose invariants `validate.first_defect` checks.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        Something is missing, or of a wrong type or length.
+    """
+    cell, low, shape = (_ints(meta[key]) for key in ("cell", "grid_min", "grid_shape"))
+    levels, left_out, dilated = _ints([meta["levels"], meta["left_out"], meta.get("dilated", 0)])
+    mask, terminal = arrays["mask"], arrays["terminal"]
+    if (len(cell), len(low), len(shape)) != (2, 3, 3) or mask.ndim != 1 or mask.shape != terminal.shape:
+        raise ValueError("arrays or header fields have a wrong length")
+    if (mask.dtype, terminal.dtype) != (NODE["mask"], bool):
+        raise ValueError("mask and terminal have wrong types")
+    if not 0 < math.prod(shape) <= len(mask) or (terminal & (mask == 0)).any():
+        raise ValueError("nodes are missing for voxels of the dense grid, or one without children is terminal")
+    return Topology(cell, low, shape, link_blocks(mask, terminal, math.prod(shape)), levels, left_out, dilated)
 
 
 def topology_hash(topology: Topology) -> str:
@@ -206,18 +258,9 @@ def read_tree(path: str | os.PathLike) -> tuple[Topology, dict]:
     """
     file = container.read(path, TREE)
     try:
-        cell, low, shape = (_ints(file.meta[key]) for key in ("cell", "grid_min", "grid_shape"))
-        levels, left_out, dilated = _ints([file.meta["levels"], file.meta["left_out"], file.meta.get("dilated", 0)])
-        mask, terminal = file.arrays["mask"], file.arrays["terminal"]
-        if (len(cell), len(low), len(shape)) != (2, 3, 3) or mask.ndim != 1 or mask.shape != terminal.shape:
-            raise ValueError("arrays or header fields have a wrong length")
-        if (mask.dtype, terminal.dtype) != (NODE["mask"], bool):
-            raise ValueError("mask and terminal have wrong types")
-        if not 0 < math.prod(shape) <= len(mask) or (terminal & (mask == 0)).any():
-            raise ValueError("nodes are missing for voxels of the dense grid, or one without children is terminal")
+        topology = tree_from(file.arrays, file.meta)
     except (KeyError, TypeError, ValueError) as error:
         raise FileError(path, container.PREFIX_BYTES, f"this is no tree: {error}") from None
-    topology = Topology(cell, low, shape, link_blocks(mask, terminal, math.prod(shape)), levels, left_out, dilated)
     defect = validate.first_defect(topology)
     if defect:
         raise FileError(path, container.PREFIX_BYTES, defect)

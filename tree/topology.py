@@ -72,6 +72,13 @@ class Topology:
         """Number of voxels, leaves included: the length of each payload."""
         return self.grid_count + int(bits.popcount(self.nodes["mask"]).sum())
 
+    @property
+    def leaves(self) -> np.ndarray:
+        """(size,) bool, which voxels have no children."""
+        found = np.ones(self.size, bool)
+        found[: len(self.nodes)] = self.nodes["mask"] == 0
+        return found
+
     def voxels(self) -> tuple[np.ndarray, np.ndarray]:
         """List all voxels in the order of their indices.
 
