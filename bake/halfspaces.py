@@ -119,17 +119,17 @@ class Trial:
             Sorted by `point`, which counts within the tile.
         """
         candidate, pair = _combine(candidates.point, self._owner, len(self._size))
-        out = heights(candidates.plane[candidate], self._place[pair]) < -self._falloff.least
-        candidate, pair = candidate[out], pair[out]
+        out = np.flatnonzero(heights(candidates.plane, self._place, candidate, pair) < -self._falloff.least)
+        candidate, pair = candidate.take(out), pair.take(out)
         for slot in range(SLOTS):
-            gain = np.bincount(candidate, self._open()[pair], len(candidates.point))
+            gain = np.bincount(candidate, self._open().take(pair), len(candidates.point))
             best, row = first_of_best(candidates.point, len(self._size), gain)
             taken = best > self._least
             self.code[slot] = np.where(taken, 0, -1)
             self.plane[slot, taken] = candidates.plane[row[taken]]
             held = np.zeros(len(gain), bool)
             held[row[taken]] = True
-            self._hides[slot, pair[held[candidate]]] = True
+            self._hides[slot, pair[held.take(candidate)]] = True
 
     def separate(self) -> None:
         """Fill empty slots with planes that part what is still lit wrongly from the rest."""
@@ -184,26 +184,36 @@ class Trial:
 
     def _heights(self, slot: int) -> np.ndarray:
         """(m,) heights of receivers above the planes in a slot [m]; far above where there is none."""
-        height = heights(self.plane[slot][self._owner], self._place)
-        return np.where(self.code[slot][self._owner] < 0, np.inf, height)
+        height = heights(self.plane[slot], self._place, self._owner)
+        return np.where((self.code[slot] < 0).take(self._owner), np.inf, height)
 
 
-def heights(plane: np.ndarray, place: np.ndarray) -> np.ndarray:
+def heights(
+    plane: np.ndarray, place: np.ndarray, planes: np.ndarray | None = None, places: np.ndarray | None = None
+) -> np.ndarray:
     """Heights of points above planes.
 
     Parameters
     ----------
     plane : (n, 4) float64 ndarray
-        Unit normal and distance [m].
-    place : (n, 3) float64 ndarray
+        Unit normals and distances [m].
+    place : (m, 3) float64 ndarray
         Points [m].
+    planes, places : (k,) int64 ndarray, optional
+        Rows of both that belong together; all in their order when left out.
 
     Returns
     -------
-    (n,) float64 ndarray
+    (k,) float64 ndarray
         Along the normal [m].
     """
-    return sum(plane[:, axis] * place[:, axis] for axis in range(3)) - plane[:, 3]
+    columns = (_column(plane, axis, planes) for axis in range(3))
+    return sum(column * _column(place, axis, places) for axis, column in enumerate(columns)) - _column(plane, 3, planes)
+
+
+def _column(table: np.ndarray, number: int, rows: np.ndarray | None) -> np.ndarray:
+    """(k,) some rows of a column: read from a copy, as every line of memory that a table's rows share holds others."""
+    return table[:, number] if rows is None else np.ascontiguousarray(table[:, number]).take(rows)
 
 
 def _combine(point: np.ndarray, owner: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:

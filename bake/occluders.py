@@ -209,11 +209,11 @@ class _Task:
 
     def factors(self, slots: _Slots, rows: np.ndarray) -> np.ndarray:
         """(k, SLOTS) what the planes leave of some pairs."""
-        point, place = self.pairs.point[rows], self.place[self.pairs.receiver[rows]]
+        point, receiver = self.pairs.point[rows], self.pairs.receiver[rows]
         out = np.ones((len(rows), SLOTS))
         for slot in range(SLOTS):
             has = np.flatnonzero(slots.code[point, slot] >= 0)
-            height = heights(slots.plane[point[has], slot], place[has])
+            height = heights(slots.plane[:, slot], self.place, point[has], receiver[has])
             out[has, slot] = self.falloff.factor(height, slots.code[point[has], slot])
         return out
 
