@@ -24,7 +24,11 @@ BLOCK_SAMPLES = 1024
 """Most samples of a point in one wavefront; part of the result's definition, as it orders the sums."""
 
 SUMMED_SAMPLES = 32
-"""Samples in one matrix product; larger products start threads of OpenBLAS, which change the last bits of the sums."""
+"""Most samples in one matrix product; larger products start threads of OpenBLAS, which change the last bits of sums."""
+
+PARTS = 8
+"""Products that a point's samples are split into at least, where there are as many: their scatter says how noisy the
+point is."""
 
 DIRECT_DIMENSIONS = paths.HASHED - 64
 """Random numbers of the direct light at the point itself, apart from every path vertex's."""
@@ -53,11 +57,13 @@ class Gathered:
     local : (n, responses, 3) float32
     sun : (n, keys, responses, 3) float32, per W/m2 of sun irradiance
     sky : (n, functions, responses, 3) float32
+    noise : (n,) float32, standard error of what the sensor watches; larger than that, as samples are spread evenly
     """
 
     local: np.ndarray
     sun: np.ndarray
     sky: np.ndarray
+    noise: np.ndarray
 
 
 def gather(
@@ -102,19 +108,22 @@ def gather(
         np.zeros((count if scene.has_local else 0, *shape), np.float32),
         np.zeros((count if suns else 0, suns, *shape), np.float32),
         np.zeros((count if functions else 0, functions, *shape), np.float32),
+        np.zeros(count if sensor.watched is not None else 0, np.float32),
     )
     if not (scene.has_local or suns or functions):
         return out
     keys = seeded(keys, effort.seed)
 
     def work(rows: np.ndarray) -> int:
-        tile = _gather_tile(scene, sensor, position[:, rows], rows, keys[rows], effort)
+        tile, noise = _gather_tile(scene, sensor, position[:, rows], rows, keys[rows], effort)
         if scene.has_local:
             out.local[rows] = tile[:, 0]
         if suns:
             out.sun[rows] = tile[:, 1 : 1 + suns]
         if functions:
             out.sky[rows] = tile[:, 1 + suns :]
+        if sensor.watched is not None:
+            out.noise[rows] = noise
         return len(rows)
 
     size = max(1, tile_size(1 + suns + functions) // min(effort.samples, BLOCK_SAMPLES))
@@ -122,19 +131,31 @@ def gather(
     return out
 
 
-def _gather_tile(scene: Scene, sensor: Sensor, position, rows, keys, effort: Effort) -> np.ndarray:
-    """(points, channels, responses, 3) measures of one tile, block after block of samples."""
+def _gather_tile(scene: Scene, sensor: Sensor, position, rows, keys, effort: Effort) -> tuple[np.ndarray, np.ndarray]:
+    """(points, channels, responses, 3) measures of one tile, block after block of samples, and (points,) noise."""
     channels = 1 + len(scene.model.suns.toward) + scene.model.sky_count
     total = np.zeros((len(rows), sensor.responses, 3 * channels))
+    squared = np.zeros(len(rows))
     for first in range(0, effort.samples, BLOCK_SAMPLES):
         count = min(BLOCK_SAMPLES, effort.samples - first)
-        total += _gather_block(scene, sensor, position, rows, Sampler(keys, first, count), count, effort.bounces)
+        sums = _gather_block(scene, sensor, position, rows, Sampler(keys, first, count), count, effort.bounces)
+        total += sums.sum(axis=0)
+        squared += _squared_noise(sums, sensor.watched)
     mean = (total / effort.samples).astype(np.float32)
-    return mean.reshape(len(rows), sensor.responses, channels, 3).transpose(0, 2, 1, 3)
+    noise = np.sqrt(squared) / effort.samples
+    return mean.reshape(len(rows), sensor.responses, channels, 3).transpose(0, 2, 1, 3), noise
+
+
+def _squared_noise(sums: np.ndarray, watched: np.ndarray | None) -> np.ndarray:
+    """(points,) variance of the sum over all parts of the watched mixture; infinite where one part can't tell."""
+    if watched is None:
+        return np.zeros(sums.shape[1])
+    found = sums[:, :, 0] @ watched.reshape(-1)
+    return found.var(axis=0, ddof=1) * len(found) if len(found) > 1 else np.full(sums.shape[1], np.inf)
 
 
 def _gather_block(scene: Scene, sensor: Sensor, position, rows, sampler: Sampler, count: int, bounces: int):
-    """(points, responses, channels * 3) sums over one block of samples."""
+    """(parts, points, responses, channels * 3) sums over parts of one block of samples."""
     point, sample = np.divmod(np.arange(len(rows) * count), count)
     numbers = Numbers(sampler, point, sample)
     lanes = np.arange(len(point))
@@ -146,22 +167,22 @@ def _gather_block(scene: Scene, sensor: Sensor, position, rows, sampler: Sampler
     stacked = light.stacked()
     stacked /= pdf
     weights = sensor.response(rows[point], direction)
-    total = _project(weights, stacked.reshape(-1, len(lanes)), len(rows), count)
+    size = SUMMED_SAMPLES if sensor.watched is None else max(1, min(SUMMED_SAMPLES, count // PARTS))
+    shape = len(rows), count, size
+    total = _project(weights, stacked.reshape(-1, len(lanes)), shape)
     for channel, toward, value in _direct(scene, sensor, start, rows[point], numbers, lanes, bounces):
         weights = sensor.response(rows[point], toward)
-        total[:, :, 3 * channel : 3 * channel + 3] += _project(weights, value, len(rows), count)
+        total[..., 3 * channel : 3 * channel + 3] += _project(weights, value, shape)
     return total
 
 
-def _project(weights: np.ndarray, values: np.ndarray, points: int, count: int) -> np.ndarray:
-    """(points, responses, channels) sums over samples, as matrix products of a few samples of each point."""
+def _project(weights: np.ndarray, values: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
+    """(parts, points, responses, channels) sums over samples, as matrix products of a few samples of each point."""
+    points, count, size = shape
     left = np.ascontiguousarray(weights.reshape(-1, points, count).transpose(1, 0, 2))
     right = np.ascontiguousarray(values.reshape(-1, points, count).transpose(1, 2, 0))
-    total = np.zeros((points, left.shape[1], right.shape[2]))
-    for first in range(0, count, SUMMED_SAMPLES):
-        part = slice(first, first + SUMMED_SAMPLES)
-        total += left[:, :, part] @ right[:, part]
-    return total
+    parts = [slice(first, first + size) for first in range(0, count, size)]
+    return np.stack([left[:, :, part] @ right[:, part] for part in parts]).astype(np.float64)
 
 
 def _direct(scene: Scene, sensor: Sensor, position, rows, numbers: Numbers, lanes, bounces: int):

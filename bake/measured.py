@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..tree.cells import OFFSET_STEPS
-from ..tree.grid import Grid
+from ..tree.grid import BRANCH, Grid
 from ..tree.region import finder
 from ..tree.topology import Topology
 from . import datapoints
@@ -30,6 +30,8 @@ class Measured:
     offset : (n, 3) int8, data point minus voxel centre in steps of the voxel size / 254
     valid : (n,) bool, False inside walls
     light : (n, functions, 9, 3) float32, irradiance harmonics of every modelled function; zero where not valid
+    noise : (n,) float32, standard error of the first harmonic of all light together, had the voxel the paths that all
+        have who don't know better; zero likewise
     """
 
     level: np.ndarray
@@ -37,6 +39,23 @@ class Measured:
     offset: np.ndarray
     valid: np.ndarray
     light: np.ndarray
+    noise: np.ndarray
+
+
+DARK = 0.1
+"""Noise counts relative to the light at a data point, and to this part of the mean where it is darker."""
+
+DOUBLINGS = (-2, 1)
+"""A quarter of the paths for the least noisy data points, twice as many for the noisiest."""
+
+FEWEST = 32
+"""Paths that a data point has at least, unless all have fewer."""
+
+BRANCH_BITS = BRANCH.bit_length() - 1
+"""Binary digits of a coordinate that one level adds."""
+
+PARTS = tuple(field.name for field in dataclasses.fields(Measured))[2:]
+"""What is measured of a voxel."""
 
 
 def take(measured: Measured, rows: np.ndarray) -> Measured:
@@ -74,11 +93,25 @@ def join(one: Measured, other: Measured) -> Measured:
     return Measured(*(np.concatenate([getattr(part, name) for part in (one, other)]) for name in names))
 
 
+@dataclass(frozen=True, eq=False)
+class Sampling:
+    """How many paths data points get: more where light is noisy.
+
+    effort : Effort, as for the first level
+    mixture : (functions, 3) float64, the light that noise is judged in
+    aim : float, the noise to aim at, relative to the light there; 0 gives all data points the same number
+    """
+
+    effort: Effort
+    mixture: np.ndarray
+    aim: float
+
+
 def measure(
     scene: Scene,
     grid: Grid,
     tree: Topology,
-    effort: Effort,
+    sampling: Sampling,
     known: Measured | None = None,
     progress: Callable[[float], bool] | None = None,
 ) -> Measured:
@@ -92,10 +125,10 @@ def measure(
         The lattice.
     tree : Topology
         The cell.
-    effort : Effort
+    sampling : Sampling
         Paths per data point.
     known : Measured, optional
-        What has been measured already with the same effort.
+        What has been measured already in the same way.
     progress : callable, optional
         Called with the part of the new data points that is done, 0 to 1; returns False to stop.
 
@@ -108,13 +141,20 @@ def measure(
     ------
     CancelledError
         `progress` returned False.
+
+    Notes
+    -----
+    Error: a data point's number of paths follows from its parent's noise. Its own would not do: who stops when all
+    looks even has missed what is rare, so that the mean would be too dark.
     """
     level, coords = tree.voxels()
     row = _rows_in(known, level, coords)
     new = np.flatnonzero(row < 0)
-    fresh = _trace(scene, grid, level[new], coords[new], effort, progress)
+    count = _counts(known, level[new], coords[new], sampling)
+    fresh = _trace(scene, grid, (level[new], coords[new], count), sampling, progress)
     out = Measured(level, coords, *(np.empty((tree.size, *part.shape[1:]), part.dtype) for part in fresh))
-    for target, part, name in zip((out.offset, out.valid, out.light), fresh, ("offset", "valid", "light"), strict=True):
+    for name, part in zip(PARTS, fresh, strict=True):
+        target = getattr(out, name)
         target[new] = part
         if known is not None:
             target[row >= 0] = getattr(known, name)[row[row >= 0]]
@@ -175,7 +215,7 @@ def move(measured: Measured, rows: np.ndarray, offset: np.ndarray, light: np.nda
     parts = [measured.offset.copy(), measured.valid.copy(), measured.light.copy()]
     for part, new in zip(parts, (offset, True, light), strict=True):
         part[rows] = new
-    return Measured(measured.level, measured.coords, *parts)
+    return Measured(measured.level, measured.coords, *parts, measured.noise)
 
 
 def positions(grid: Grid, level: np.ndarray, coords: np.ndarray, offset: np.ndarray) -> np.ndarray:
@@ -262,19 +302,52 @@ def functions(scene: Scene) -> int:
     return int(scene.has_local) + len(scene.model.suns.toward) + scene.model.sky_count
 
 
-def _trace(scene: Scene, grid: Grid, level: np.ndarray, coords: np.ndarray, effort: Effort, progress):
-    """(offset, valid, light) of some voxels."""
+def _trace(scene: Scene, grid: Grid, voxels: tuple, sampling: Sampling, progress):
+    """(offset, valid, light, noise) of some voxels, given as levels, coordinates and numbers of paths."""
+    level, coords, count = voxels
     size = np.asarray(grid.voxel_size(level.astype(np.int64)), np.float64)
     key = datapoints.keys(level, coords)
-    placed = datapoints.place(scene, grid.centers(level, coords), size, key, effort.threads)
+    placed = datapoints.place(scene, grid.centers(level, coords), size, key, sampling.effort.threads)
     light = np.zeros((len(level), functions(scene), 9, 3), np.float32)
-    rows = np.flatnonzero(placed.valid)
-    order = rows[datapoints.morton_order(placed.position[:, rows])]
-    if light.shape[1]:
-        position = np.ascontiguousarray(placed.position[:, order])
-        show = progress and (lambda done: progress(done / max(len(order), 1)))
-        light[order] = stack(scene, gather(scene, HarmonicsSensor(), position, key[order], effort, show))
-    return placed.offset, placed.valid, light
+    noise = np.zeros(len(level), np.float32)
+    sensor, done = HarmonicsSensor(_watched(scene, sampling.mixture)), 0
+    for number in np.unique(count[placed.valid]) if light.shape[1] else ():
+        rows = np.flatnonzero(placed.valid & (count == number))
+        order = rows[datapoints.morton_order(placed.position[:, rows])]
+        show = progress and _share_of(progress, done, len(order), int(placed.valid.sum()))
+        effort = dataclasses.replace(sampling.effort, samples=int(number))
+        found = gather(scene, sensor, np.ascontiguousarray(placed.position[:, order]), key[order], effort, show)
+        light[order], done = stack(scene, found), done + len(order)
+        noise[order] = found.noise * np.sqrt(number / sampling.effort.samples)
+    return placed.offset, placed.valid, light, noise
+
+
+def _share_of(progress: Callable[[float], bool], before: int, count: int, total: int) -> Callable[[int], bool]:
+    """Progress of some data points among all that are new."""
+    return lambda done: progress((before + done) / max(total, 1))
+
+
+def _watched(scene: Scene, mixture: np.ndarray) -> np.ndarray:
+    """(1 + keys + functions, 3) mixture of all channels of paths, of those that are modelled."""
+    missing = np.zeros((0 if scene.has_local else 1, 3))
+    return np.concatenate([missing, mixture])
+
+
+def _counts(known: Measured | None, level: np.ndarray, coords: np.ndarray, sampling: Sampling) -> np.ndarray:
+    """(n,) int64 paths for each voxel, by the noise of its parent."""
+    base = sampling.effort.samples
+    count = np.full(len(level), base)
+    if known is None or not (sampling.aim and known.valid.any()):
+        return count
+    row = _rows_in(known, level.astype(np.int64) - 1, coords >> BRANCH_BITS)
+    judged = np.flatnonzero((row >= 0) & known.valid[row])
+    light = np.einsum("nfc,fc->n", known.light[:, :, 0], sampling.mixture)
+    floor = DARK * np.abs(light[known.valid]).mean()
+    relative = known.noise / np.maximum(np.hypot(light, floor), 1e-30)
+    doublings = np.round(2 * np.log2(np.maximum(relative[row[judged]], 1e-9) / sampling.aim))
+    scaled = base * 2.0 ** np.clip(doublings, *DOUBLINGS)
+    count[judged] = np.maximum(scaled, min(base, FEWEST)).astype(np.int64)
+    return count
 
 
 def _rows_in(known: Measured | None, level: np.ndarray, coords: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from ..tree.cells import tree_from, tree_parts
 from ..tree.container import FileError
 from ..tree.grid import Grid
 from ..tree.topology import Topology
-from .measured import Measured
+from .measured import PARTS, Measured
 from .receivers import FIELDS, Receivers, none
 from .survey import Seen
 
@@ -27,7 +27,7 @@ __all__ = ["FOLDER", "Look", "Memory", "Moved", "digest", "files", "load", "memo
 FOLDER = "memory"
 """Where the files lie within the folder of a bake."""
 
-KIND, VERSION = "memory", 1
+KIND, VERSION = "memory", 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +135,7 @@ def save(memory: Memory, target: str | os.PathLike) -> int:
     """
     tree, moved = memory.tree, memory.moved
     arrays, meta = tree_parts(tree)
-    arrays |= {f"measured/{name}": getattr(memory.measured, name) for name in ("offset", "valid", "light")}
+    arrays |= {f"measured/{name}": getattr(memory.measured, name) for name in PARTS}
     arrays |= {f"moved/{name}": getattr(moved, name) for name in ("row", "offset", "light")}
     for level, look in enumerate(memory.looks):
         arrays[f"look/{level}/coords"], arrays[f"look/{level}/light"] = look.coords, look.seen.light
@@ -203,7 +203,7 @@ def _memory(file: container.Container, grid: Grid) -> Memory:
     tree = tree_from(arrays, meta)
     if validate.first_defect(tree):
         raise ValueError("the tree is broken")
-    measured = Measured(*tree.voxels(), *(arrays[f"measured/{name}"] for name in ("offset", "valid", "light")))
+    measured = Measured(*tree.voxels(), *(arrays[f"measured/{name}"] for name in PARTS))
     moved = Moved(*(arrays[f"moved/{name}"] for name in ("row", "offset", "light")))
     looks = []
     for level in range(meta["counts"][0]):
@@ -226,6 +226,7 @@ def _check(memory: Memory) -> None:
         (memory.measured.light, (size, *light)),
         (memory.measured.offset, (size, 3)),
         (memory.measured.valid, (size,)),
+        (memory.measured.noise, (size,)),
         (memory.pilot, (size, *light)),
         (memory.moved.offset, (len(memory.moved.row), 3)),
         (memory.moved.light, (len(memory.moved.row), *light)),

@@ -26,7 +26,8 @@ from ..tree.topology import Topology
 from . import judges, occluders, parallel, receivers
 from .datapoints import FARTHEST_STEP
 from .gather import Effort
-from .measured import Measured, measure, move, moved_light
+from .lamps import LUMINANCE
+from .measured import Measured, Sampling, measure, move, moved_light
 from .memory import Look, Moved
 from .receivers import Receivers
 from .scene import Scene
@@ -49,6 +50,10 @@ FRONT = 0.05
 
 AWAY = 0.25
 """A data point that moves to an unlit receiver goes at most this far in front of it [voxels]."""
+
+NOISE = 0.35
+"""Noise of a data point to aim at, as a part of the target error. It is estimated as if paths were spread by chance; as
+they are not, it is about a quarter then, which adds a thirtieth to the error."""
 
 GEOMETRY = 1e30
 """Need of first-level voxels with varied geometry: they come before everything that light asks for."""
@@ -213,7 +218,8 @@ class Refinement:
         """The tree of what is needed so far, measured."""
         target = self.target
         tree = build.fit(self.outline, self.need, target.dilation, target.max_points, self.asked)
-        measured = measure(self.scene, self.grid, tree, target.effort, self._known(), self._show())
+        sampling = Sampling(target.effort, self.judge.mean * LUMINANCE, NOISE * target.error)
+        measured = measure(self.scene, self.grid, tree, sampling, self._known(), self._show())
         data = interpolate.join(self.grid, [tree], measured.offset, measured.valid)
         self.state = State(tree, measured, data, self.state and self.state.seen)
 

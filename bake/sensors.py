@@ -16,9 +16,18 @@ from .paths import GRAZING
 
 
 class Sensor(Protocol):
-    """Sample, density and response of one kind of measure; `responses` numbers for each point."""
+    """Sample, density and response of one kind of measure.
+
+    Attributes
+    ----------
+    responses : int
+        Numbers for each point.
+    watched : (1 + keys + functions, 3) float64 ndarray or None
+        Mixture of local light, suns and sky whose noise is wanted, in the first response.
+    """
 
     responses: int
+    watched: np.ndarray | None
 
     def sample(self, rows: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Directions to look in.
@@ -70,9 +79,18 @@ class Sensor(Protocol):
 
 
 class HarmonicsSensor:
-    """Measures the nine harmonics of irradiance around points in free space."""
+    """Measures the nine harmonics of irradiance around points in free space.
+
+    Parameters
+    ----------
+    watched : (1 + keys + functions, 3) float64 ndarray, optional
+        As in `Sensor`; the first response is the mean over directions, but for a factor.
+    """
 
     responses = harmonics.COUNT
+
+    def __init__(self, watched: np.ndarray | None = None) -> None:
+        self.watched = watched
 
     def sample(self, rows: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Uniform directions.
@@ -139,7 +157,7 @@ class SurfaceSensor:
         Unit normals of all points.
     """
 
-    responses = 1
+    responses, watched = 1, None
 
     def __init__(self, normal: np.ndarray) -> None:
         self._normal = normal
