@@ -202,6 +202,8 @@ def _add_bake(commands) -> None:
     command.add_argument("--early", action="store_true", help=text)
     text = "keep what is measured in DIR/memory, and measure again only what has changed since"
     command.add_argument("--incremental", action="store_true", help=text)
+    text = "refine cells, those near the camera first, for about this long; each has a coarse look at least"
+    command.add_argument("--minutes", type=_minutes, default=0.0, help=text)
     _add_light(command)
 
 
@@ -248,10 +250,14 @@ def _run_bake(options, extract: Extract, progress: Progress) -> dict:
     own = {"error": error, "fit": not options.no_fit, "dilation": options.dilation, "method": options.method}
     own |= {"max_points": options.max_points, "max_bytes": options.max_bytes}
     settings = dataclasses.replace(settings, **own)
+    if options.minutes and options.incremental:
+        raise SettingsError(
+            "--minutes and --incremental: one or the other, as only whole cells can be remembered"
+        )
     check_target(options.output)
     snapshot = _read_scene(options.scene, extract, progress)
-    manner = options.threads, progress, options.early, options.incremental
-    outcome = job.bake(snapshot, options.output, settings, options.cells, *manner)
+    manner = job.Manner(options.threads, options.early, options.incremental, 60 * options.minutes)
+    outcome = job.bake(snapshot, options.output, settings, options.cells, manner, progress)
     return dataclasses.asdict(outcome)
 
 
@@ -413,6 +419,17 @@ def _error(text: str) -> float:
         value = -1.0
     if not 0 <= value <= 1:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number from 0 to 1")
+    return value
+
+
+def _minutes(text: str) -> float:
+    """A time, more than none."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of minutes above 0")
     return value
 
 

@@ -25,6 +25,7 @@ from ..tree.region import finder
 from ..tree.topology import Topology
 from . import judges, occluders, parallel, receivers
 from .datapoints import FARTHEST_STEP
+from .deadline import Pace
 from .gather import Effort
 from .lamps import LUMINANCE
 from .measured import Measured, Sampling, measure, move, moved_light
@@ -171,6 +172,10 @@ class Refinement:
         Data points before some were moved into cracks.
     moved : Moved
         Those.
+    pace : Pace or None
+        Limits data points, so that the cell is done in time.
+    cut : bool
+        Whether time has been too short for what is needed.
     """
 
     def __init__(self, scene: Scene, outline: Outline, judge: Judge, target: Target, progress):
@@ -187,6 +192,8 @@ class Refinement:
         self.judged: tuple | None = None
         self.unmoved: Measured | None = None
         self.moved: Moved | None = None
+        self.pace: Pace | None = None
+        self.cut = False
 
     def run(self) -> State:
         """Go level by level, coarse to fine.
@@ -217,11 +224,20 @@ class Refinement:
     def _grow(self) -> None:
         """The tree of what is needed so far, measured."""
         target = self.target
-        tree = build.fit(self.outline, self.need, target.dilation, target.max_points, self.asked)
+        cap = self._cap()
+        tree = build.fit(self.outline, self.need, target.dilation, cap, self.asked)
+        self.cut |= cap < target.max_points and tree.left_out > self.outline.left_out
         sampling = Sampling(target.effort, self.judge.mean * LUMINANCE, NOISE * target.error)
         measured = measure(self.scene, self.grid, tree, sampling, self._known(), self._show())
         data = interpolate.join(self.grid, [tree], measured.offset, measured.valid)
         self.state = State(tree, measured, data, self.state and self.state.seen)
+        if self.pace:
+            self.pace.grown(tree.size)
+
+    def _cap(self) -> int:
+        """Most data points that there may be, and that there is time for."""
+        affordable = self.pace and self.pace.affordable()
+        return self.target.max_points if affordable is None else min(affordable, self.target.max_points)
 
     def _known(self) -> Measured | None:
         """Data points that need not be measured any more."""

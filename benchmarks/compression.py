@@ -102,7 +102,7 @@ def bake(snapshot_path: Path, samples: int, seed: int = 0) -> Baked:
 
     settings = Settings(samples, 6, sky="harmonics", sun="hemisphere", seed=seed)
     with tempfile.TemporaryDirectory() as place, mock.patch.object(folder, "write_cell", keep):
-        job.bake(snapshot_file.load(snapshot_path), Path(place), settings, threads=1)
+        job.bake(snapshot_file.load(snapshot_path), Path(place), settings, manner=job.Manner(1))
         header = folder.load_header(place)
         cells = [folder.read_cell(place, tuple(entry["cell"])) for entry in header["cells"]]
     return Baked(header, cells, [kept[cell.topology.cell] for cell in cells])

@@ -130,14 +130,14 @@ def figures(before: Snapshot, after: Snapshot, settings: Settings, runs: int) ->
     seconds, kept = {"again": [], "whole": []}, {}
     with tempfile.TemporaryDirectory() as scratch:
         first, again, whole = (Path(scratch) / name for name in ("first", "again", "whole"))
-        job.bake(before, first, settings, incremental=True)
+        job.bake(before, first, settings, manner=job.Manner(incremental=True))
         for _ in range(runs):
             for path in (again, whole):
                 shutil.rmtree(path, ignore_errors=True)
             shutil.copytree(first, again)
             for path in (again, whole):
                 start = time.perf_counter()
-                outcome = job.bake(after, path, settings, incremental=path is again)
+                outcome = job.bake(after, path, settings, manner=job.Manner(incremental=path is again))
                 seconds[path.name].append(time.perf_counter() - start)
                 kept[path.name] = outcome.kept / outcome.data_points
         found = {f"{name} [s]": float(np.median(part)) for name, part in seconds.items()}

@@ -60,7 +60,7 @@ def corner() -> Snapshot:
 def whole(tmp_path_factory) -> Path:
     """All cells, baked at once."""
     target = tmp_path_factory.mktemp("whole")
-    job.bake(corner(), target, QUICK, threads=1)
+    job.bake(corner(), target, QUICK, manner=job.Manner(1))
     return target
 
 
@@ -83,7 +83,7 @@ def apart(tmp_path_factory) -> tuple[Path, list]:
             words = (scene, "-o", target, f"--cells={cell[0]},{cell[1]}", *WORDS)
             subprocess.run([sys.executable, "-m", "gi_volumes", "bake", *map(str, words)], check=True)
         else:
-            job.bake(corner(), target, QUICK, [cell], threads=1)
+            job.bake(corner(), target, QUICK, [cell], job.Manner(1))
         steps.append((verify.verify(target), look_around(target)))
     return target, steps
 
@@ -258,7 +258,7 @@ def differences(means) -> np.ndarray:
 def test_all_cells_of_an_even_scene_are_equally_bright_and_a_scaled_one_is_caught(tmp_path):
     found, planted = [], []
     for seed in range(SEEDS):
-        job.bake(EVEN, tmp_path, Settings(samples=64, bounces=2, seed=seed, finest=0.5), threads=1)
+        job.bake(EVEN, tmp_path, Settings(samples=64, bounces=2, seed=seed, finest=0.5), manner=job.Manner(1))
         for scale, means in ((1.0, found), (SCALED, planted)):
             baked = world.load(tmp_path)
             scale_cell(baked, 2, scale)
@@ -309,7 +309,7 @@ def mean_over_normals(scene: Snapshot, points: np.ndarray) -> np.ndarray:
 def test_light_reaches_data_points_of_a_neighbour_that_is_baked_alone(name, tmp_path):
     """As traced, so that their noise is independent, and without a normal, so that it takes no harmonics."""
     scene = lit_from_across(name)
-    job.bake(scene, tmp_path, Settings(512, 3, finest=0.5, error=0.0, fit=False), [(0, 0)], threads=1)
+    job.bake(scene, tmp_path, Settings(512, 3, finest=0.5, error=0.0, fit=False), [(0, 0)], job.Manner(1))
     baked = world.load(tmp_path)
     points = own_points(baked)
     ratio = baked.irradiance(points, np.zeros_like(points)).mean(axis=1, dtype=float) / mean_over_normals(scene, points)
@@ -327,7 +327,7 @@ BARE = 1.5
 def test_surfaces_of_a_neighbour_that_is_baked_alone_are_lit_as_exactly_as_was_asked_for(name, tmp_path):
     """From a metre on: nearer to the border half of what surrounds a point is missing."""
     scene, settings = lit_from_across(name), Settings(samples=512, bounces=3, error=0.1, finest=0.5)
-    job.bake(scene, tmp_path, settings, [(0, 0)], threads=1)
+    job.bake(scene, tmp_path, settings, [(0, 0)], job.Manner(1))
     xy = np.random.default_rng(4).uniform((1.2, 0.2), (3.5, 2.4), (300, 2))
     points, normals = np.column_stack([xy, np.zeros(300)]), np.tile([0, 0, 1.0], (300, 1))
     truth = reference.irradiance(scene, points, normals, samples=512, bounces=3, seed=5, threads=1).mean(axis=1)

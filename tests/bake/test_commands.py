@@ -48,6 +48,12 @@ def python(*words: object, **options) -> subprocess.CompletedProcess:
     return subprocess.run(command, capture_output=True, text=True, stdin=subprocess.DEVNULL, timeout=120, **options)
 
 
+def test_a_limit_on_time_and_what_is_kept_for_later_exclude_each_other(tmp_path):
+    said = call("bake", "level.giv", "-o", tmp_path / "out", "--minutes", "1", "--incremental")
+    assert said.reason.startswith("--minutes and --incremental: one or the other")
+    assert not (tmp_path / "out").exists()
+
+
 def test_bake_prints_one_object_with_the_keys_that_programs_rely_on(level, tmp_path):
     done = python("bake", level, "-o", tmp_path / "out", *QUICK, "--json")
     result = json.loads(done.stdout)
@@ -396,6 +402,10 @@ def test_the_surface_cache_follows_light_for_longer_unless_told_otherwise(level,
         ["bake", "level.giv", "-o", "out", "--error", "nan"],
         ["bake", "level.giv", "-o", "out", "--error", "1.01"],
         ["bake", "level.giv", "-o", "out", "--error", "small"],
+        ["bake", "level.giv", "-o", "out", "--minutes", "0"],
+        ["bake", "level.giv", "-o", "out", "--minutes", "nan"],
+        ["bake", "level.giv", "-o", "out", "--minutes", "inf"],
+        ["bake", "level.giv", "-o", "out", "--minutes", "soon"],
         ["bake", "level.giv", "-o", "out", "--max-points", "0"],
         ["bake", "level.giv", "-o", "out", "--max-points", "65536"],
         ["bake", "level.giv", "-o", "out", "--max-points", "1e3"],

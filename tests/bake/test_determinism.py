@@ -246,7 +246,7 @@ def house():
 @pytest.fixture(scope="module")
 def house_baked(tmp_path_factory):
     target = tmp_path_factory.mktemp("house")
-    job.bake(house(), target, HOUSE, threads=1)
+    job.bake(house(), target, HOUSE, manner=job.Manner(1))
     return target
 
 
@@ -261,7 +261,7 @@ def test_the_house_is_subdivided_fitted_and_has_planes_on_both_sides_of_its_bord
         level = cell.topology.voxels()[0]
         assert level.max() == 2
         assert (cell.planes.planes >= 0).any()
-    job.bake(house(), tmp_path, Settings(**{**vars(HOUSE), "fit": False}), threads=1)
+    job.bake(house(), tmp_path, Settings(**{**vars(HOUSE), "fit": False}), manner=job.Manner(1))
     other = folder.read_cell(tmp_path, (0, 0))
     assert np.array_equal(other.topology.nodes, found[-1].topology.nodes)
     for name in TRANSPORTS:
@@ -270,5 +270,5 @@ def test_the_house_is_subdivided_fitted_and_has_planes_on_both_sides_of_its_bord
 
 def test_threads_order_and_split_of_a_whole_bake_change_no_byte(house_baked, tmp_path):
     for part in ([CELLS[3]], CELLS[1:3], [CELLS[0]]):
-        job.bake(house(), tmp_path, HOUSE, part, threads=2)
+        job.bake(house(), tmp_path, HOUSE, part, job.Manner(2))
     assert cells_only(tmp_path) == cells_only(house_baked)

@@ -48,7 +48,7 @@ def moved(by: float):
 def first(tmp_path_factory):
     """A bake that remembers."""
     target = tmp_path_factory.mktemp("first")
-    job.bake(house(), target, SETTINGS, threads=1, incremental=True)
+    job.bake(house(), target, SETTINGS, manner=job.Manner(1, incremental=True))
     return target
 
 
@@ -60,7 +60,7 @@ def again(first, tmp_path):
         target = tmp_path / "again"
         if not target.exists():
             copy(first, target)
-        return target, job.bake(snapshot, target, settings, threads=threads, incremental=True)
+        return target, job.bake(snapshot, target, settings, manner=job.Manner(threads, incremental=True))
 
     return bake
 
@@ -73,7 +73,7 @@ def copy(source, target):
 
 
 def full(snapshot, target):
-    job.bake(snapshot, target, SETTINGS, threads=2)
+    job.bake(snapshot, target, SETTINGS, manner=job.Manner(2))
     return target
 
 
@@ -177,7 +177,7 @@ def test_the_number_of_threads_changes_no_byte(first, tmp_path):
     for threads in (1, 3):
         target = tmp_path / str(threads)
         copy(first, target)
-        job.bake(house(moved(2.0), other=0.5), target, SETTINGS, threads=threads, incremental=True)
+        job.bake(house(moved(2.0), other=0.5), target, SETTINGS, manner=job.Manner(threads, incremental=True))
         made.append(cells_only(target) | {path.name: path.read_bytes() for path in memory.files(target)})
     assert made[0] == made[1]
 
@@ -204,7 +204,7 @@ def test_other_settings_or_a_damaged_memory_mean_a_whole_bake(first, again, tmp_
     path = memory.memory_path(place, (0, 0))
     path.write_bytes(path.read_bytes()[:-1])
     assert memory.load(place, (0, 0), grid, rules) is None
-    outcome = job.bake(house(lamp=1 + 1e-6), place, SETTINGS, threads=2, incremental=True)
+    outcome = job.bake(house(lamp=1 + 1e-6), place, SETTINGS, manner=job.Manner(2, incremental=True))
     assert outcome.kept == outcome.data_points - folder.read_cell(first, (0, 0)).topology.size
 
 
@@ -284,9 +284,9 @@ def simple(lamp=(30, 0, 0), suns=((1, 0, 1), (-1, 0, 1)), strength=(3.0, 3.0), w
 
 def both(before, after, tmp_path, settings=SETTINGS):
     """A bake again, and a whole one."""
-    job.bake(before, tmp_path / "again", settings, threads=2, incremental=True)
-    outcome = job.bake(after, tmp_path / "again", settings, threads=2, incremental=True)
-    job.bake(after, tmp_path / "whole", settings, threads=2)
+    job.bake(before, tmp_path / "again", settings, manner=job.Manner(2, incremental=True))
+    outcome = job.bake(after, tmp_path / "again", settings, manner=job.Manner(2, incremental=True))
+    job.bake(after, tmp_path / "whole", settings, manner=job.Manner(2))
     return tmp_path / "again", tmp_path / "whole", outcome
 
 
@@ -365,20 +365,20 @@ def test_a_memory_that_does_not_fit_is_not_used(first, tmp_path, what):
     arrays, meta = spoiled(container.read(path), what)
     container.write(path, "memory", arrays, meta)
     assert memory.load(tmp_path, (0, 0), grid_of(first), rules_of(first)) is None
-    outcome = job.bake(house(lamp=1 + 1e-6), tmp_path, SETTINGS, threads=2, incremental=True)
+    outcome = job.bake(house(lamp=1 + 1e-6), tmp_path, SETTINGS, manner=job.Manner(2, incremental=True))
     assert outcome.kept == outcome.data_points - folder.read_cell(first, (0, 0)).topology.size
 
 
 def test_a_re_bake_that_was_stopped_goes_on(first, tmp_path, monkeypatch):
     copy(first, tmp_path)
     there = house(moved(2.0), other=0.5)
-    job.bake(there, tmp_path, SETTINGS, [(1, 0)], threads=1, incremental=True)
+    job.bake(there, tmp_path, SETTINGS, [(1, 0)], job.Manner(1, incremental=True))
     assert memory.memory_path(tmp_path, (0, 0)).exists()
-    outcome = job.bake(there, tmp_path, SETTINGS, threads=1, incremental=True)
+    outcome = job.bake(there, tmp_path, SETTINGS, manner=job.Manner(1, incremental=True))
     assert outcome.kept > 0
-    job.bake(there, tmp_path / "at once", SETTINGS, threads=1, incremental=True)
+    job.bake(there, tmp_path / "at once", SETTINGS, manner=job.Manner(1, incremental=True))
     copy(first, tmp_path / "other")
-    job.bake(there, tmp_path / "other", SETTINGS, threads=1, incremental=True)
+    job.bake(there, tmp_path / "other", SETTINGS, manner=job.Manner(1, incremental=True))
     assert cells_only(tmp_path) == cells_only(tmp_path / "other")
 
 

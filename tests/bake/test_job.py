@@ -305,6 +305,22 @@ def test_a_black_sky_of_functions_is_judged_as_a_white_one():
     assert judge.mean[-9:, 0].tolist() == pytest.approx([np.sqrt(4 * np.pi)] + [0] * 8)
 
 
+def test_without_time_every_cell_is_an_early_look_and_the_next_bake_goes_on(row, row_baked, tmp_path):
+    result = succeed("bake", row, "-o", tmp_path, *QUICK, "--minutes", "1e-9")
+    assert f"time was too short for {CELLS} of {CELLS} cells (0,0/1,0/2,0)" in result["warnings"][0]
+    assert 0 < result["data_points"] < sum(cell["data_points"] for cell in succeed("info", row.parent / "whole")["cells"])
+    assert not any("not baked yet" in text for text in result["warnings"])
+    assert len(call("verify", tmp_path, "--json").object["defects"]) == CELLS
+    succeed("bake", row, "-o", tmp_path, *QUICK)
+    assert content(tmp_path) == row_baked
+
+
+def test_with_time_enough_a_limit_changes_nothing(row, row_baked, tmp_path):
+    result = succeed("bake", row, "-o", tmp_path, *QUICK, "--minutes", "60")
+    assert not any("time" in text for text in result["warnings"])
+    assert content(tmp_path) == row_baked
+
+
 def test_no_early_look_takes_the_place_of_another_bake(row, tmp_path):
     succeed("bake", row, "-o", tmp_path, *QUICK, "--seed", "9")
     before = content(tmp_path)

@@ -252,11 +252,11 @@ def test_a_bake_by_the_cache_sees_what_paths_see(tmp_path):
 
 @pytest.mark.usefixtures("always")
 def test_cells_baked_one_by_one_by_the_cache_are_those_baked_together(tmp_path):
-    whole = job.bake(WORLD, tmp_path / "whole", QUICK, threads=1)
+    whole = job.bake(WORLD, tmp_path / "whole", QUICK, manner=job.Manner(1))
     cells = [(i, j) for i in (-1, 0) for j in (-1, 0)]
     assert whole.cells == len(cells)
     for cell in reversed(cells):
-        job.bake(WORLD, tmp_path / "parts", QUICK, [cell], threads=2)
+        job.bake(WORLD, tmp_path / "parts", QUICK, [cell], job.Manner(2))
     assert cells_only(tmp_path / "parts") == cells_only(tmp_path / "whole")
 
 
@@ -275,8 +275,8 @@ def test_a_cell_of_a_large_scene_does_not_depend_on_the_others(tmp_path):
     """Larger than a cell, so that each cell has a cache of its own."""
     large = build_scenes.snapshot([(build_scenes.plane(90.0), matte(0.6)), *BLOCKS[1:]], WORLD.lights, (0.7, 0.8, 1.0))
     settings = dataclasses.replace(QUICK, samples=8, finest=2.0)
-    job.bake(large, tmp_path / "both", settings, [(-1, 0), (0, 0)], threads=2)
-    job.bake(large, tmp_path / "one", settings, [(0, 0)], threads=1)
+    job.bake(large, tmp_path / "both", settings, [(-1, 0), (0, 0)], job.Manner(2))
+    job.bake(large, tmp_path / "one", settings, [(0, 0)], job.Manner(1))
     one, both = cells_only(tmp_path / "one"), cells_only(tmp_path / "both")
     assert one
     assert one == {name: both[name] for name in one}

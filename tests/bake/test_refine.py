@@ -7,7 +7,7 @@ from command_line import yard
 from gi_volumes.bake import job
 from gi_volumes.bake.gather import Effort
 from gi_volumes.bake.parallel import CancelledError
-from gi_volumes.bake.refine import Target, refine
+from gi_volumes.bake.refine import Refinement, Target, refine
 from gi_volumes.bake.scene import prepare
 from gi_volumes.bake.settings import Settings, choose_grid, model
 from gi_volumes.tree.outline import outline
@@ -26,6 +26,38 @@ def parts(error: float = 0.05):
         job._judge(snapshot, settings, scene),
         target,
     )
+
+
+class Patience:
+    """Has time for so many data points."""
+
+    def __init__(self, points: int) -> None:
+        self.points, self.sizes = points, []
+
+    def grown(self, size: int) -> None:
+        self.sizes.append(size)
+
+    def affordable(self) -> int | None:
+        return self.points if self.sizes else None
+
+
+def limited(points: int) -> Refinement:
+    """A cell refined with time for so many data points."""
+    made = Refinement(*parts(), None)
+    made.pace = Patience(points)
+    made.run()
+    return made
+
+
+def test_a_cell_grows_to_what_there_is_time_for_and_says_that_it_was_cut_short():
+    whole = refine(*parts()).tree.size
+    first = limited(1 << 16).pace.sizes[0]
+    middle = (first + whole) // 2
+    for points, cut in ((middle, True), (whole, False)):
+        made = limited(points)
+        assert made.cut == cut
+        assert first <= made.state.tree.size <= points
+    assert made.state.tree.size == whole
 
 
 def test_progress_grows_from_0_to_at_most_1():
