@@ -11,6 +11,12 @@ import time
 FINISHING = 0.75
 """What planes, fits and files of the whole cell take per data point, of what growing took for each new one."""
 
+USUAL = 4e-3
+"""Time for each new data point before that is known [s]: what two processors take for two cells at once."""
+
+FEWEST = 256
+"""New data points that a step has to have to tell: what every step takes, however small, does not count then."""
+
 
 class Deadline:
     """When a bake is to be done.
@@ -56,7 +62,7 @@ class Pace:
 
     def __init__(self, deadline: Deadline, clock) -> None:
         self._deadline, self._clock = deadline, clock
-        self._began, self._size, self._cost = clock(), 0, 0.0
+        self._began, self._size, self._cost = clock(), 0, USUAL
 
     def grown(self, size: int) -> None:
         """Take note of a step that is done.
@@ -67,7 +73,7 @@ class Pace:
             Data points that the cell has now.
         """
         now = self._clock()
-        if size > self._size:
+        if size >= self._size + FEWEST:
             self._cost = (now - self._began) / (size - self._size)
         self._began, self._size = now, size
 
@@ -77,10 +83,10 @@ class Pace:
         Returns
         -------
         int or None
-            Data points, at least those that it has; None without a limit, and before anything is known.
+            Data points, at least those that it has; None without a limit, and for a cell that has none yet.
         """
         left = self._deadline.left
-        if left == float("inf") or not self._cost:
+        if left == float("inf") or not self._size:
             return None
         more = (left - FINISHING * self._cost * self._size) / ((1 + FINISHING) * self._cost)
         return self._size + max(int(more), 0)

@@ -249,8 +249,9 @@ class _Counts:
     left_out: int
 
     @classmethod
-    def of(cls, tree: Topology) -> _Counts:
-        return cls(tree.size, tree.dilated, tree.left_out)
+    def of(cls, tree: Topology, is_cut: bool) -> _Counts:
+        """What time was too short for is left out neither by the cap nor by anything else."""
+        return cls(tree.size, tree.dilated, 0 if is_cut else tree.left_out)
 
 
 def _look_early(work: Work, cells: list[tuple[int, int]], progress: Progress) -> None:
@@ -290,7 +291,7 @@ def _bake_cells(work: Work, cells: list[tuple[int, int]], progress: Progress) ->
         else:
             tree = bake_cell(work, cell, lambda share: show(number, share))
         show(number, 1.0)
-        return _Counts.of(tree)
+        return _Counts.of(tree, cell in work.cut)
 
     return run_jobs(bake_one, len(cells), work.target.effort.threads)
 

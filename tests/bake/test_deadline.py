@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from gi_volumes.bake.deadline import FINISHING, Deadline
+from gi_volumes.bake.deadline import FEWEST, FINISHING, USUAL, Deadline
 
 
 class Clock:
@@ -38,30 +38,36 @@ def test_time_that_is_left_falls_to_nothing(clock):
     assert deadline.left == 0
 
 
-def test_a_cell_of_which_nothing_is_known_may_grow(clock):
+def test_a_cell_without_data_points_may_grow(clock):
     assert Deadline(1.0, clock).pace().affordable() is None
 
 
 def test_a_cell_grows_by_what_can_be_finished_in_time(clock):
-    deadline = Deadline(100.0, clock)
-    pace = deadline.pace()
-    clock.now += 10
-    pace.grown(100)  # 0.1 s each
-    allowed = pace.affordable()
-    growing, finishing = 0.1 * (allowed - 100), FINISHING * 0.1 * allowed
-    assert 90 - 0.2 < growing + finishing <= 90
-
-
-def test_the_pace_is_that_of_the_last_step_and_steps_without_growth_do_not_count(clock):
     pace = Deadline(1000.0, clock).pace()
     clock.now += 100
-    pace.grown(10)
-    clock.now += 10
-    pace.grown(110)  # 0.1 s each
+    pace.grown(1000)  # 0.1 s each
+    allowed = pace.affordable()
+    growing, finishing = 0.1 * (allowed - 1000), FINISHING * 0.1 * allowed
+    assert 900 - 0.2 < growing + finishing <= 900
+
+
+def test_the_pace_is_that_of_the_last_large_step(clock):
+    pace = Deadline(10000.0, clock).pace()
+    clock.now += 100
+    pace.grown(FEWEST)
+    clock.now += 100
+    pace.grown(FEWEST + 1000)  # 0.1 s each
     fast = pace.affordable()
     clock.now += 1
-    pace.grown(110)
-    assert fast - 20 < pace.affordable() < fast
+    pace.grown(2 * FEWEST + 999)  # too few to tell
+    assert abs(pace.affordable() - fast) < FEWEST
+
+
+def test_before_the_pace_is_known_a_usual_one_counts(clock):
+    pace = Deadline(100.0, clock).pace()
+    clock.now += 40
+    pace.grown(18)
+    assert pace.affordable() == pytest.approx(60 / (1 + FINISHING) / USUAL, abs=20)
 
 
 def test_a_cell_that_is_late_keeps_its_size(clock):
