@@ -14,14 +14,13 @@ from ..tree.grid import Grid
 from ..tree.lookup import Atlas
 from ..tree.outline import Outline
 from ..tree.region import finder
-from ..tree.topology import Topology
-from . import changes, judges, occluders, parallel, receivers
-from .blocks import BLOCK, Blocks, by_level, voxels_of
+from . import changes, receivers
+from .blocks import by_level
 from .changes import Past
 from .measured import Measured, join, move, take
 from .memory import Memory
 from .receivers import Receivers
-from .refine import Refinement, Target
+from .refine import Hidden, Refinement, Target, rows_in
 from .scene import Scene
 from .survey import Judge, Seen, State
 
@@ -58,16 +57,14 @@ class Again(Refinement):
         new = Atlas([self.state.tree]).find(self.kept.level.astype(np.int64), self.kept.coords) < 0
         return join(take(self.kept, new), self.state.measured)
 
-    def _found(self, level: int) -> Seen:
+    def _found(self, level: int, coords: np.ndarray) -> Seen:
         """Those that are known; others in voxels that are new or have other surfaces."""
-        of_level, coords = self.state.tree.voxels()
-        coords = coords[of_level == level]
         known = self._is_looked(level, coords) & ~self.past.surfaces.touch(level, coords)
         seen = self._seen_in(level, coords[~known])
         if not known.any():
             return seen
         old, has = self.memory.looks[level].seen, receivers.among(coords[known])
-        return old.take(has(self._voxels(level, old.at.position))).plus(seen)
+        return old.take(has(self.grid.voxels_at(level, old.at.position))).plus(seen)
 
     def _is_looked(self, level: int, coords: np.ndarray) -> np.ndarray:
         """(n,) which voxels had receivers of their level."""
@@ -81,11 +78,7 @@ class Again(Refinement):
     def _is_open(self, at: Receivers) -> np.ndarray:
         """(n,) which receivers lie in such voxels of the level that was looked at last."""
         level = len(self.looks) - 1
-        return self._open(level, self._voxels(level, at.position))
-
-    def _voxels(self, level: int, position: np.ndarray) -> np.ndarray:
-        """(n, 3) voxels that hold positions."""
-        return np.floor(position / float(self.grid.voxel_size(level))).astype(np.int64)
+        return self._open(level, self.grid.voxels_at(level, at.position))
 
     def _near(self, at: Receivers) -> np.ndarray:
         """Receivers in voxels to be decided on, and those that share data points with them."""
@@ -143,53 +136,25 @@ class Again(Refinement):
         row = Atlas([self.state.tree]).find(some.level.astype(np.int64), some.coords)
         return np.where(by_level(self.past.decide.touch, some), -1, row)
 
+    def _hide_midway(self) -> None:
+        """Planes of before where nothing is decided; others anew."""
+        measured = self.state.measured
+        new = by_level(self.past.decide.touch, measured) | self._beside_surfaces()
+        self._hide_since(Hidden(self.memory.tree, self.memory.measured, self.memory.planes, self.memory.plane), new)
+
     def _hide_finally(self) -> None:
         """Planes of before where neither tree nor surfaces have changed, nor data points been moved; others anew."""
-        parallel.check()
-        tree, measured, threads = self.state.tree, self.state.measured, self.target.effort.threads
-        new = by_level(self._changed_voxels().beside, measured) | by_level(self.past.surfaces.touch, measured)
+        memory = self.memory
+        there = move(memory.measured, memory.moved.row, memory.moved.offset, memory.moved.light)
+        self._hide_since(Hidden(memory.tree, there, memory.planes, memory.plane), self._beside_surfaces())
+
+    def _beside_surfaces(self) -> np.ndarray:
+        """(points,) which data points have, or light, surfaces that have changed."""
+        tree, measured = self.state.tree, self.state.measured
+        new = by_level(self.past.surfaces.touch, measured)
         for blocks in (self.past.surfaces, self.past.beyond):
             new |= changes.lights(blocks, tree, measured)
-        row = _rows(tree, self.memory.tree)
-        planes = np.where(row[:, None] >= 0, self.memory.planes[np.maximum(row, 0)], -1)
-        plane = self.memory.plane
-        if new.any():
-            self._set_planes(np.where(new[:, None], -1, planes), plane)
-            hidden = occluders.fit(self.scene, self.state.data, self._judges_of(new), threads, only=new)
-            planes[new] = np.where(hidden.planes[new] >= 0, hidden.planes[new] + len(plane), -1)
-            plane = np.concatenate([plane, hidden.plane])
-        self._set_planes(*_distinct(planes, plane))
-
-    def _changed_voxels(self) -> Blocks:
-        """Voxels that are new, are gone, or have another data point."""
-        memory, here = self.memory, self.state.measured
-        there = move(memory.measured, memory.moved.row, memory.moved.offset, memory.moved.light)
-        row = _rows(self.state.tree, memory.tree)
-        new = row < 0
-        off = ~new & ((here.offset != there.offset[row]).any(axis=1) | (here.valid != there.valid[row]))
-        gone = _rows(memory.tree, self.state.tree) < 0
-        return Blocks([*voxels_of(take(here, new | off)).marks, *voxels_of(take(there, gone)).marks])
-
-    def _judges_of(self, new: np.ndarray) -> Receivers:
-        """Receivers that some data points may light: as dense as in a first bake around fine ones and leaves, around
-        other coarse ones those whose light is traced."""
-        tree, measured, at = self.state.tree, self.state.measured, self.state.seen.at
-        coarse = (measured.level < BLOCK) & ~tree.leaves
-        close = by_level(voxels_of(take(measured, new & ~coarse)).beside, measured)
-        dense = judges.around(self.scene, self.grid, tree, self.target.effort.threads, close)
-        others, seen = voxels_of(take(measured, new & coarse)), np.zeros(len(at.key), bool)
-        for level in range(BLOCK):
-            seen |= others.beside(level, self._voxels(level, at.position))
-        return receivers.join([dense, at.take(seen)])
-
-
-def _distinct(planes: np.ndarray, plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Planes that are used, each once, as `Occluders` has them."""
-    used = planes >= 0
-    table, row = np.unique(plane[planes[used]].reshape(-1, 5), axis=0, return_inverse=True)
-    out = np.full(planes.shape, -1, np.int32)
-    out[used] = row.reshape(-1)
-    return out, table
+        return new
 
 
 def settled(past: Past, grid: Grid) -> State:
@@ -239,7 +204,7 @@ def remember(made: Refinement, causes: dict[str, str], rules: str, past: Past | 
     """
     state, scene = made.state, made.scene
     paths = np.zeros(made.unmoved.light.shape, np.float32)
-    row = np.full(state.tree.size, -1) if past is None else _rows(state.tree, past.memory.tree)
+    row = np.full(state.tree.size, -1) if past is None else rows_in(state.tree, past.memory.tree)
     kept = (row >= 0) & (past.known[row] if past is not None else False)
     if past is not None:
         paths[kept] = past.pilot[row[kept]]
@@ -255,9 +220,3 @@ def remember(made: Refinement, causes: dict[str, str], rules: str, past: Past | 
     return Memory(
         state.tree, *own, state.data.planes, state.data.plane, *surfaces, scene.cache is not None, causes, rules
     )
-
-
-def _rows(tree: Topology, other: Topology) -> np.ndarray:
-    """(size,) row of each voxel of a tree in another one; -1 where it has none."""
-    level, coords = tree.voxels()
-    return Atlas([other]).find(level.astype(np.int64), coords)

@@ -241,16 +241,21 @@ class _Update:
 
     def measured(self, measured: Measured, stale: np.ndarray) -> Measured:
         """Data points, some of them with light of today."""
-        rows, light = np.flatnonzero(stale & measured.valid), measured.light.copy()
-        order = rows[datapoints.morton_order(_places(self.grid, take(measured, rows)).T)]
-        light[order[:, None], self.columns] = self._light(measured, order, measured.offset[order])
+        light = measured.light.copy()
+        for count in np.unique(measured.paths):
+            rows = np.flatnonzero(stale & measured.valid & (measured.paths == count))
+            order = rows[datapoints.morton_order(_places(self.grid, take(measured, rows)).T)]
+            found = self._light(measured, order, measured.offset[order], int(count))
+            light[order[:, None], self.columns] = found
         return dataclasses.replace(measured, light=light)
 
     def moved(self, memory: Memory, stale: np.ndarray) -> Moved:
         """Those in cracks."""
         moved, light = memory.moved, memory.moved.light.copy()
         rows = np.flatnonzero(stale[moved.row] | ~memory.measured.valid[moved.row])
-        light[rows[:, None], self.columns] = self._light(memory.measured, moved.row[rows], moved.offset[rows])
+        light[rows[:, None], self.columns] = self._light(
+            memory.measured, moved.row[rows], moved.offset[rows], self.effort.samples
+        )
         return dataclasses.replace(moved, light=light)
 
     def look(self, look: Look, rows: np.ndarray) -> Look:
@@ -262,9 +267,10 @@ class _Update:
         light[:, rows[:, None], self.columns] = fresh.light
         return Look(look.coords, Seen(look.seen.at, light))
 
-    def _light(self, measured: Measured, rows: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    def _light(self, measured: Measured, rows: np.ndarray, offset: np.ndarray, paths: int) -> np.ndarray:
         """(m, columns, 9, 3) light in some voxels."""
-        return moved_light(self.scene, self.grid, measured, rows, offset, self.effort)
+        effort = dataclasses.replace(self.effort, samples=paths)
+        return moved_light(self.scene, self.grid, measured, rows, offset, effort)
 
 
 class _Around:

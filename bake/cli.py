@@ -27,6 +27,7 @@ from .settings import (
     QUALITIES,
     Settings,
     SettingsError,
+    check_words,
     has_free_sun,
     numbers,
     of_reference,
@@ -251,9 +252,7 @@ def _run_bake(options, extract: Extract, progress: Progress) -> dict:
     own |= {"max_points": options.max_points, "max_bytes": options.max_bytes}
     settings = dataclasses.replace(settings, **own)
     if options.minutes and options.incremental:
-        raise SettingsError(
-            "--minutes and --incremental: one or the other, as only whole cells can be remembered"
-        )
+        raise SettingsError("--minutes and --incremental: one or the other, as only whole cells can be remembered")
     check_target(options.output)
     snapshot = _read_scene(options.scene, extract, progress)
     manner = job.Manner(options.threads, options.early, options.incremental, 60 * options.minutes)
@@ -264,7 +263,9 @@ def _run_bake(options, extract: Extract, progress: Progress) -> dict:
 def _settings(options, samples: int, bounces: int, finest: float = 0.0) -> Settings:
     """Settings from the words of the command line."""
     bounces = bounces if options.bounces is None else options.bounces
-    return Settings(samples, bounces, options.sky, options.sun, finest, options.seed)
+    settings = Settings(samples, bounces, options.sky, options.sun, finest, options.seed)
+    check_words(settings)
+    return settings
 
 
 def _read_scene(path: Path, extract: Extract, progress: Progress) -> Snapshot:

@@ -188,7 +188,7 @@ def trust(system: System, traced: np.ndarray, halves: np.ndarray) -> np.ndarray:
     error = np.maximum(_around(system, (first * second).sum(axis=(1, 2))), 0.0)
     doubt = DOUBT * _around(system, np.abs(first * second).sum(axis=(1, 2))) / np.maximum(_around(system), 1.0)
     ratio = (noise + doubt) / np.maximum(error + doubt, NOTHING)
-    return np.minimum(LEAST_TRUST + NOISE_TRUST * ratio, MOST_TRUST)
+    return np.minimum(LEAST_TRUST + NOISE_TRUST * ratio, MOST_TRUST) * _local_weight(system)
 
 
 def evaluate(system: System, values: np.ndarray) -> np.ndarray:
@@ -223,6 +223,13 @@ def _around(system: System, values: np.ndarray | None = None) -> np.ndarray:
     share = system.weight * (system.receiver if values is None else system.receiver * values)[:, None]
     row = np.where(system.weight != 0, system.row, 0)
     return np.bincount(row.ravel(), share.ravel() / _mean(system.receiver), system.points)
+
+
+def _local_weight(system: System) -> np.ndarray:
+    """(points,) mean weight of the receivers around each data point; 1 where there are none."""
+    row = np.where(system.weight != 0, system.row, 0)
+    number = np.bincount(row.ravel(), system.weight.ravel(), system.points)
+    return np.where(number > 0, _around(system) / np.maximum(number, NOTHING), 1.0)
 
 
 def _mean(weights: np.ndarray) -> float:

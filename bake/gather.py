@@ -57,7 +57,8 @@ class Gathered:
     local : (n, responses, 3) float32
     sun : (n, keys, responses, 3) float32, per W/m2 of sun irradiance
     sky : (n, functions, responses, 3) float32
-    noise : (n,) float32, standard error of what the sensor watches; larger than that, as samples are spread evenly
+    noise : (n, watched) float32, standard errors of what the sensor watches; larger than that, as samples are spread
+        evenly
     """
 
     local: np.ndarray
@@ -108,7 +109,7 @@ def gather(
         np.zeros((count if scene.has_local else 0, *shape), np.float32),
         np.zeros((count if suns else 0, suns, *shape), np.float32),
         np.zeros((count if functions else 0, functions, *shape), np.float32),
-        np.zeros(count if sensor.watched is not None else 0, np.float32),
+        np.zeros((count, len(sensor.watched)), np.float32),
     )
     if not (scene.has_local or suns or functions):
         return out
@@ -122,8 +123,7 @@ def gather(
             out.sun[rows] = tile[:, 1 : 1 + suns]
         if functions:
             out.sky[rows] = tile[:, 1 + suns :]
-        if sensor.watched is not None:
-            out.noise[rows] = noise
+        out.noise[rows] = noise
         return len(rows)
 
     size = max(1, tile_size(1 + suns + functions) // min(effort.samples, BLOCK_SAMPLES))
@@ -132,10 +132,10 @@ def gather(
 
 
 def _gather_tile(scene: Scene, sensor: Sensor, position, rows, keys, effort: Effort) -> tuple[np.ndarray, np.ndarray]:
-    """(points, channels, responses, 3) measures of one tile, block after block of samples, and (points,) noise."""
+    """(points, channels, responses, 3) measures of a tile, block by block of samples, and (points, watched) noise."""
     channels = 1 + len(scene.model.suns.toward) + scene.model.sky_count
     total = np.zeros((len(rows), sensor.responses, 3 * channels))
-    squared = np.zeros(len(rows))
+    squared = np.zeros((len(rows), len(sensor.watched)))
     for first in range(0, effort.samples, BLOCK_SAMPLES):
         count = min(BLOCK_SAMPLES, effort.samples - first)
         sums = _gather_block(scene, sensor, position, rows, Sampler(keys, first, count), count, effort.bounces)
@@ -146,12 +146,12 @@ def _gather_tile(scene: Scene, sensor: Sensor, position, rows, keys, effort: Eff
     return mean.reshape(len(rows), sensor.responses, channels, 3).transpose(0, 2, 1, 3), noise
 
 
-def _squared_noise(sums: np.ndarray, watched: np.ndarray | None) -> np.ndarray:
-    """(points,) variance of the sum over all parts of the watched mixture; infinite where one part can't tell."""
-    if watched is None:
-        return np.zeros(sums.shape[1])
-    found = sums[:, :, 0] @ watched.reshape(-1)
-    return found.var(axis=0, ddof=1) * len(found) if len(found) > 1 else np.full(sums.shape[1], np.inf)
+def _squared_noise(sums: np.ndarray, watched: np.ndarray) -> np.ndarray:
+    """(points, watched) variances of sums over all parts; infinite where one part can't tell."""
+    if not len(watched):
+        return np.zeros((sums.shape[1], 0))
+    found = sums[:, :, 0] @ watched.reshape(len(watched), -1).T
+    return found.var(axis=0, ddof=1) * len(found) if len(found) > 1 else np.full(found.shape[1:], np.inf)
 
 
 def _gather_block(scene: Scene, sensor: Sensor, position, rows, sampler: Sampler, count: int, bounces: int):
@@ -167,7 +167,7 @@ def _gather_block(scene: Scene, sensor: Sensor, position, rows, sampler: Sampler
     stacked = light.stacked()
     stacked /= pdf
     weights = sensor.response(rows[point], direction)
-    size = SUMMED_SAMPLES if sensor.watched is None else max(1, min(SUMMED_SAMPLES, count // PARTS))
+    size = max(1, min(SUMMED_SAMPLES, count // PARTS)) if len(sensor.watched) else SUMMED_SAMPLES
     shape = len(rows), count, size
     total = _project(weights, stacked.reshape(-1, len(lanes)), shape)
     for channel, toward, value in _direct(scene, sensor, start, rows[point], numbers, lanes, bounces):

@@ -21,7 +21,7 @@ from ..tree import build, folder
 from ..tree.grid import FIRST_SIZE, Grid
 from ..tree.topology import Topology
 from . import changes, memory, snapshot_file, summary
-from .cell import History, Work, bake_cell, list_of, look_early
+from .cell_job import History, Work, bake_cell, list_of, look_early
 from .check import Check
 from .deadline import Deadline
 from .gather import Effort

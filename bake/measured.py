@@ -30,8 +30,9 @@ class Measured:
     offset : (n, 3) int8, data point minus voxel centre in steps of the voxel size / 254
     valid : (n,) bool, False inside walls
     light : (n, functions, 9, 3) float32, irradiance harmonics of every modelled function; zero where not valid
-    noise : (n,) float32, standard error of the first harmonic of all light together, had the voxel the paths that all
-        have who don't know better; zero likewise
+    noise : (n, views) float32, standard error of the first harmonic of each transport, relative to it, had the voxel as
+        many paths as those of the first level; zero likewise
+    paths : (n,) int32, how many it had
     """
 
     level: np.ndarray
@@ -40,16 +41,20 @@ class Measured:
     valid: np.ndarray
     light: np.ndarray
     noise: np.ndarray
+    paths: np.ndarray
 
 
 DARK = 0.1
-"""Noise counts relative to the light at a data point, and to this part of the mean where it is darker."""
+"""Noise counts relative to the light at a data point, and to this part of the first level's mean where it is darker."""
 
 DOUBLINGS = (-2, 1)
 """A quarter of the paths for the least noisy data points, twice as many for the noisiest."""
 
 FEWEST = 32
 """Paths that a data point has at least, unless all have fewer."""
+
+FAINT = 1e-3
+"""Least light that noise is relative to, in that noise."""
 
 BRANCH_BITS = BRANCH.bit_length() - 1
 """Binary digits of a coordinate that one level adds."""
@@ -98,12 +103,12 @@ class Sampling:
     """How many paths data points get: more where light is noisy.
 
     effort : Effort, as for the first level
-    mixture : (functions, 3) float64, the light that noise is judged in
+    views : (v, functions, 3) float64, mixtures of functions that noise is judged in: one for each transport
     aim : float, the noise to aim at, relative to the light there; 0 gives all data points the same number
     """
 
     effort: Effort
-    mixture: np.ndarray
+    views: np.ndarray
     aim: float
 
 
@@ -215,7 +220,7 @@ def move(measured: Measured, rows: np.ndarray, offset: np.ndarray, light: np.nda
     parts = [measured.offset.copy(), measured.valid.copy(), measured.light.copy()]
     for part, new in zip(parts, (offset, True, light), strict=True):
         part[rows] = new
-    return Measured(measured.level, measured.coords, *parts, measured.noise)
+    return Measured(measured.level, measured.coords, *parts, measured.noise, measured.paths)
 
 
 def positions(grid: Grid, level: np.ndarray, coords: np.ndarray, offset: np.ndarray) -> np.ndarray:
@@ -303,14 +308,14 @@ def functions(scene: Scene) -> int:
 
 
 def _trace(scene: Scene, grid: Grid, voxels: tuple, sampling: Sampling, progress):
-    """(offset, valid, light, noise) of some voxels, given as levels, coordinates and numbers of paths."""
+    """(offset, valid, light, noise, paths) of some voxels, given as levels, coordinates and numbers of paths."""
     level, coords, count = voxels
     size = np.asarray(grid.voxel_size(level.astype(np.int64)), np.float64)
     key = datapoints.keys(level, coords)
     placed = datapoints.place(scene, grid.centers(level, coords), size, key, sampling.effort.threads)
     light = np.zeros((len(level), functions(scene), 9, 3), np.float32)
-    noise = np.zeros(len(level), np.float32)
-    sensor, done = HarmonicsSensor(_watched(scene, sampling.mixture)), 0
+    noise = np.zeros((len(level), len(sampling.views)), np.float32)
+    sensor, done = HarmonicsSensor(_watched(scene, sampling.views)), 0
     for number in np.unique(count[placed.valid]) if light.shape[1] else ():
         rows = np.flatnonzero(placed.valid & (count == number))
         order = rows[datapoints.morton_order(placed.position[:, rows])]
@@ -318,8 +323,14 @@ def _trace(scene: Scene, grid: Grid, voxels: tuple, sampling: Sampling, progress
         effort = dataclasses.replace(sampling.effort, samples=int(number))
         found = gather(scene, sensor, np.ascontiguousarray(placed.position[:, order]), key[order], effort, show)
         light[order], done = stack(scene, found), done + len(order)
-        noise[order] = found.noise * np.sqrt(number / sampling.effort.samples)
-    return placed.offset, placed.valid, light, noise
+        seen = np.maximum(_seen(light[order], sampling.views), FAINT * found.noise)
+        noise[order] = found.noise / np.where(seen > 0, seen, 1) * np.sqrt(number / sampling.effort.samples)
+    return placed.offset, placed.valid, light, noise, count.astype(np.int32)
+
+
+def _seen(light: np.ndarray, views: np.ndarray) -> np.ndarray:
+    """(n, v) first harmonic of each transport."""
+    return np.abs(np.einsum("nfc,vfc->nv", light[:, :, 0], views))
 
 
 def _share_of(progress: Callable[[float], bool], before: int, count: int, total: int) -> Callable[[int], bool]:
@@ -327,27 +338,35 @@ def _share_of(progress: Callable[[float], bool], before: int, count: int, total:
     return lambda done: progress((before + done) / max(total, 1))
 
 
-def _watched(scene: Scene, mixture: np.ndarray) -> np.ndarray:
-    """(1 + keys + functions, 3) mixture of all channels of paths, of those that are modelled."""
-    missing = np.zeros((0 if scene.has_local else 1, 3))
-    return np.concatenate([missing, mixture])
+def _watched(scene: Scene, views: np.ndarray) -> np.ndarray:
+    """(v, 1 + keys + functions, 3) mixtures of all channels of paths, of those that are modelled."""
+    missing = np.zeros((len(views), 0 if scene.has_local else 1, 3))
+    return np.concatenate([missing, views], axis=1)
 
 
 def _counts(known: Measured | None, level: np.ndarray, coords: np.ndarray, sampling: Sampling) -> np.ndarray:
     """(n,) int64 paths for each voxel, by the noise of its parent."""
     base = sampling.effort.samples
     count = np.full(len(level), base)
-    if known is None or not (sampling.aim and known.valid.any()):
+    if known is None or not sampling.aim:
         return count
     row = _rows_in(known, level.astype(np.int64) - 1, coords >> BRANCH_BITS)
-    judged = np.flatnonzero((row >= 0) & known.valid[row])
-    light = np.einsum("nfc,fc->n", known.light[:, :, 0], sampling.mixture)
-    floor = DARK * np.abs(light[known.valid]).mean()
-    relative = known.noise / np.maximum(np.hypot(light, floor), 1e-30)
-    doublings = np.round(2 * np.log2(np.maximum(relative[row[judged]], 1e-9) / sampling.aim))
+    judged = np.flatnonzero((row >= 0) & known.valid[row]) if len(known.level) else row[:0]
+    relative = _relative_noise(known, sampling.views)[row[judged]]
+    doublings = np.round(2 * np.log2(np.maximum(relative, 1e-9) / sampling.aim))
     scaled = base * 2.0 ** np.clip(doublings, *DOUBLINGS)
     count[judged] = np.maximum(scaled, min(base, FEWEST)).astype(np.int64)
     return count
+
+
+def _relative_noise(known: Measured, views: np.ndarray) -> np.ndarray:
+    """(n,) noise over light, where each transport counts relative to its mean on the first level: how strong lamps, sun
+    and sky are is for others to choose."""
+    light = _seen(known.light, views)
+    mean = light[known.valid & (known.level == 0)].mean(axis=0) if (known.valid & (known.level == 0)).any() else 0.0
+    share = np.divide(1.0, mean, out=np.zeros(light.shape[1]), where=np.broadcast_to(mean, light.shape[1:]) > 0)
+    bright, noise = (light * share).sum(axis=1), np.sqrt(((known.noise * light * share) ** 2).sum(axis=1))
+    return noise / np.maximum(np.hypot(bright, DARK * np.count_nonzero(share)), 1e-30)
 
 
 def _rows_in(known: Measured | None, level: np.ndarray, coords: np.ndarray) -> np.ndarray:

@@ -487,11 +487,11 @@ def _add_emitters(scene: Scene, wave: Wave, vertex: Vertex, numbers: Numbers, bo
 
 def _add_suns(scene: Scene, wave: Wave, vertex: Vertex, numbers: Numbers, bounce: int, light: Radiance) -> None:
     """One shadow ray to every sun key: choosing one of many is far noisier than it is cheap."""
-    keys = scene.model.suns
-    for key in range(len(keys.toward)):
-        dimension = HASHED + bounce * HASHED_PER_VERTEX + SUN_DISK
-        u = numbers.draw(wave.lane, dimension, 2) if keys.diameter[key] > 0 else None
-        toward = sun_direction(keys.toward[key], keys.diameter[key], u, len(wave.lane))
+    keys, u = scene.model.suns, None
+    if (keys.diameter > 0).any():
+        u = numbers.draw(wave.lane, HASHED + bounce * HASHED_PER_VERTEX + SUN_DISK, 2)
+    for key, diameter in enumerate(keys.diameter):
+        toward = sun_direction(keys.toward[key], diameter, u if diameter > 0 else None, len(wave.lane))
         cosine = np.maximum(warp.dot(toward, vertex.normal), 0)
         rows, tint = unblocked(scene, vertex.position, toward, FAR, cosine > 0)
         _collect(light.sun[key], wave, vertex, rows, cosine[rows] * tint)

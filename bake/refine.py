@@ -9,7 +9,7 @@ no data point lights get voxels in front of them, and in cracks the voxel's own 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,11 +24,12 @@ from ..tree.outline import Outline
 from ..tree.region import finder
 from ..tree.topology import Topology
 from . import judges, occluders, parallel, receivers
+from .blocks import BLOCK, Blocks, by_level, voxels_of
 from .datapoints import FARTHEST_STEP
 from .deadline import Pace
 from .gather import Effort
 from .lamps import LUMINANCE
-from .measured import Measured, Sampling, measure, move, moved_light
+from .measured import Measured, Sampling, functions, measure, move, moved_light, take
 from .memory import Look, Moved
 from .receivers import Receivers
 from .scene import Scene
@@ -146,6 +147,20 @@ def sketch(scene: Scene, outline: Outline, judge: Judge, target: Target) -> Stat
     return made.state
 
 
+@dataclass(frozen=True, eq=False)
+class Hidden:
+    """Planes of a tree as it was.
+
+    tree : Topology, measured : Measured, its data points
+    planes, plane : as in `Occluders`
+    """
+
+    tree: Topology
+    measured: Measured
+    planes: np.ndarray
+    plane: np.ndarray
+
+
 class Refinement:
     """One cell on its way: what has been decided, by level, and what has been measured.
 
@@ -172,6 +187,8 @@ class Refinement:
         Data points before some were moved into cracks.
     moved : Moved
         Those.
+    hidden : Hidden or None
+        Planes before the last revision.
     pace : Pace or None
         Limits data points, so that the cell is done in time.
     cut : bool
@@ -192,6 +209,7 @@ class Refinement:
         self.judged: tuple | None = None
         self.unmoved: Measured | None = None
         self.moved: Moved | None = None
+        self.hidden: Hidden | None = None
         self.pace: Pace | None = None
         self.cut = False
 
@@ -206,20 +224,43 @@ class Refinement:
         for level in range(self.grid.levels):
             self._grow()
             self._look(level)
-            self.asked[level] = self._unlit(level)
-            if len(self.asked[level]):
-                self._grow()
-                self._hide(self.state.seen.at)
+            self._ask([level])
             if level == self.grid.levels - 1:
                 break
             if self.target.error:
                 self.need[level] = np.maximum(self.need[level], self._wanting(level))
             if not (self.need[level] > 0).any():
                 break
+        if self.target.error and self.grid.levels > 1:
+            self._hide_midway()
+            self._revise()
         self.unmoved = self.state.measured
         self._take_moved(self._fill_cracks())
         self._hide_finally()
         return self.state
+
+    def _revise(self) -> None:
+        """Subdivide coarse voxels that are poor now: finer neighbours, and the planes that will stay, change what they
+        show."""
+        before = Atlas([self.state.tree])
+        for level in range(self.grid.levels - 1):
+            self.need[level] = np.maximum(self.need[level], self._wanting(level))
+        self._grow()
+        of_level, coords = self.state.tree.voxels()
+        for level in range(self.grid.levels):
+            own = coords[of_level == level]
+            self._look_in(level, own[before.find(level, own) < 0])
+        self._hide(self.state.seen.at)
+        self._ask(range(len(self.looks)))
+
+    def _ask(self, levels: Iterable[int]) -> None:
+        """Add voxels that are missing in front of receivers."""
+        found = [(level, self._unlit(level)) for level in levels]
+        for level, coords in found:
+            self.asked[level] = np.unique(np.concatenate([self.asked[level], coords]), axis=0)
+        if any(len(coords) for _, coords in found):
+            self._grow()
+            self._hide(self.state.seen.at)
 
     def _grow(self) -> None:
         """The tree of what is needed so far, measured."""
@@ -227,7 +268,7 @@ class Refinement:
         cap = self._cap()
         tree = build.fit(self.outline, self.need, target.dilation, cap, self.asked)
         self.cut |= cap < target.max_points and tree.left_out > self.outline.left_out
-        sampling = Sampling(target.effort, self.judge.mean * LUMINANCE, NOISE * target.error)
+        sampling = Sampling(target.effort, self.judge.views * LUMINANCE, NOISE * target.error)
         measured = measure(self.scene, self.grid, tree, sampling, self._known(), self._show())
         data = interpolate.join(self.grid, [tree], measured.offset, measured.valid)
         self.state = State(tree, measured, data, self.state and self.state.seen)
@@ -246,19 +287,27 @@ class Refinement:
     def _look(self, level: int) -> None:
         """Receivers for every level up to one; those of voxels that were subdivided are replaced by denser ones."""
         of_level, coords = self.state.tree.voxels()
-        self.looks.append(Look(coords[of_level == level], self._found(level)))
-        seen, first = self.looks[-1].seen, sum(len(look.seen.at.key) for look in self.looks[:-1])
-        new = first + np.arange(len(seen.at.key))
-        if self.state.seen is not None:
-            kept = ~_voxels_of(self.grid, self.state.tree, level)(self.state.seen.at.position)
-            seen, new = self.state.seen.take(kept).plus(seen), np.concatenate([self.current[kept], new])
-        self.state, self.current = dataclasses.replace(self.state, seen=seen), new
-        self._hide(seen.at)
+        self._look_in(level, coords[of_level == level])
+        self._hide(self.state.seen.at)
 
-    def _found(self, level: int) -> Seen:
-        """Receivers on all surfaces in the tree's voxels of a level, with their light."""
-        of_level, coords = self.state.tree.voxels()
-        return self._seen_in(level, coords[of_level == level])
+    def _look_in(self, level: int, coords: np.ndarray) -> None:
+        """Receivers in voxels of a level that have none of that level yet."""
+        while len(self.looks) <= level:
+            self.looks.append(Look(coords[:0], Seen.none(functions(self.scene))))
+        found, old = self._found(level, coords), self.looks[level]
+        end = sum(len(look.seen.at.key) for look in self.looks[: level + 1])
+        self.looks[level] = Look(np.concatenate([old.coords, coords]), old.seen.plus(found))
+        new, current = np.arange(len(found.at.key)), self.current
+        current = np.where(current >= end, current + len(new), current)
+        seen = found if self.state.seen is None else self.state.seen
+        if self.state.seen is not None:
+            kept = ~receivers.among(coords)(self.grid.voxels_at(level, seen.at.position))
+            seen, current = seen.take(kept).plus(found), current[kept]
+        self.state, self.current = dataclasses.replace(self.state, seen=seen), np.concatenate([current, end + new])
+
+    def _found(self, level: int, coords: np.ndarray) -> Seen:
+        """Receivers on all surfaces in voxels of a level, with their light."""
+        return self._seen_in(level, coords)
 
     def _seen_in(self, level: int, coords: np.ndarray) -> Seen:
         """Receivers in some of the tree's voxels of a level, traced."""
@@ -268,7 +317,7 @@ class Refinement:
         near = receivers.touching(coords, size)
 
         def inside(position: np.ndarray) -> np.ndarray:
-            return has(np.floor(position / size).astype(np.int64))
+            return has(self.grid.voxels_at(level, position))
 
         at = receivers.spread(self.scene, low, high, spacing, inside, effort.threads, touches=near)
         return trace(self.scene, at, dataclasses.replace(effort, samples=self.target.samples), self._show())
@@ -281,10 +330,56 @@ class Refinement:
         """Planes for all data points, as receivers with light see them, which are there anyway."""
         self._fit_planes(at.take(self._near(at)))
 
-    def _hide_finally(self) -> None:
+    def _hide_midway(self) -> None:
         """Planes for all data points, as dense receivers on all surfaces see them that the cell may light, those of
         other cells too."""
         self._fit_planes(judges.around(self.scene, self.grid, self.state.tree, self.target.effort.threads))
+        data = self.state.data
+        self.hidden = Hidden(self.state.tree, self.state.measured, data.planes, data.plane)
+
+    def _hide_finally(self) -> None:
+        """The same for what has changed since."""
+        if self.hidden is None:
+            self._hide_midway()
+        else:
+            self._hide_since(self.hidden, np.zeros(self.state.tree.size, bool))
+
+    def _hide_since(self, old: Hidden, new: np.ndarray) -> None:
+        """Planes of before, but for some data points, and those around whatever is new, gone, or elsewhere."""
+        parallel.check()
+        tree, measured, threads = self.state.tree, self.state.measured, self.target.effort.threads
+        new = new | by_level(self._changed_since(old).beside, measured)
+        row, plane = rows_in(tree, old.tree), old.plane
+        planes = np.where(row[:, None] >= 0, old.planes[np.maximum(row, 0)], -1)
+        if new.any():
+            self._set_planes(np.where(new[:, None], -1, planes), plane)
+            hidden = occluders.fit(self.scene, self.state.data, self._judges_of(new), threads, only=new)
+            planes[new] = np.where(hidden.planes[new] >= 0, hidden.planes[new] + len(plane), -1)
+            plane = np.concatenate([plane, hidden.plane])
+        self._set_planes(*_distinct(planes, plane))
+
+    def _changed_since(self, old: Hidden) -> Blocks:
+        """Voxels that are new, are gone, or have another data point."""
+        here, there = self.state.measured, old.measured
+        row = rows_in(self.state.tree, old.tree)
+        new = row < 0
+        off = ~new & ((here.offset != there.offset[row]).any(axis=1) | (here.valid != there.valid[row]))
+        gone = rows_in(old.tree, self.state.tree) < 0
+        return Blocks([*voxels_of(take(here, new | off)).marks, *voxels_of(take(there, gone)).marks])
+
+    def _judges_of(self, new: np.ndarray) -> Receivers:
+        """Receivers that some data points may light: dense around fine ones and leaves, around other coarse ones those
+        whose light is traced."""
+        tree, measured, at = self.state.tree, self.state.measured, self.state.seen.at
+        if new.all():
+            return judges.around(self.scene, self.grid, tree, self.target.effort.threads)
+        coarse = (measured.level < BLOCK) & ~tree.leaves
+        close = by_level(voxels_of(take(measured, new & ~coarse)).beside, measured)
+        dense = judges.around(self.scene, self.grid, tree, self.target.effort.threads, close)
+        others, seen = voxels_of(take(measured, new & coarse)), np.zeros(len(at.key), bool)
+        for level in range(BLOCK):
+            seen |= others.beside(level, self.grid.voxels_at(level, at.position))
+        return receivers.join([dense, at.take(seen)])
 
     def _fit_planes(self, at: Receivers) -> None:
         """Planes as some receivers see the data points."""
@@ -312,8 +407,7 @@ class Refinement:
     def _wanting(self, level: int) -> np.ndarray:
         """What subdivision of each solid voxel of a level buys for each data point; 0 where it is good enough."""
         coords, at = self.outline.coords[level], self.state.seen.at
-        voxel = np.floor(at.position / float(self.grid.voxel_size(level))).astype(np.int64)
-        row = finder(coords)(voxel)
+        row = finder(coords)(self.grid.voxels_at(level, at.position))
         inside, row = np.flatnonzero(row >= 0), row[row >= 0]
         area, count = at.area[inside], len(coords)
         squared, noise = (np.bincount(row, values[inside] * area, count) for values in self._errors())
@@ -391,23 +485,51 @@ class Refinement:
         return np.bincount(row.ravel(), share.ravel(), len(self.state.measured.level))
 
     def _show(self) -> Callable[[float], bool] | None:
-        """What the next stage is to call with the part of it that is done; each level has up to three."""
+        """What the next stage is to call with the part of it that is done; each level has up to three, the revision one
+        for each level and two."""
         parallel.check()
-        show, stage, count = self.progress, self.stage, 3 * self.grid.levels
+        show, stage, levels = self.progress, self.stage, self.grid.levels
+        count = 4 * levels + 2
         self.stage += 1
         return None if show is None else lambda share: show((stage + share) / count)
 
 
 def _voxels_of(grid: Grid, tree: Topology, level: int) -> Callable[[np.ndarray], np.ndarray]:
     """A function that says which positions lie in a tree's voxels of a level."""
-    atlas, size = Atlas([tree]), float(grid.voxel_size(level))
-    return lambda position: atlas.find(level, np.floor(position / size).astype(np.int64)) >= 0
+    atlas = Atlas([tree])
+    return lambda position: atlas.find(level, grid.voxels_at(level, position)) >= 0
 
 
 def _leaves(grid: Grid, tree: Topology, position: np.ndarray) -> np.ndarray:
     """(n,) finest voxel that holds each position."""
     atlas, row = Atlas([tree]), np.zeros(len(position), np.int64)
     for level in range(grid.levels):
-        found = atlas.find(level, np.floor(position / float(grid.voxel_size(level))).astype(np.int64))
+        found = atlas.find(level, grid.voxels_at(level, position))
         row = np.where(found >= 0, found, row)
     return row
+
+
+def rows_in(tree: Topology, other: Topology) -> np.ndarray:
+    """Find the voxels of a tree in another one.
+
+    Parameters
+    ----------
+    tree, other : Topology
+        Of the same cell.
+
+    Returns
+    -------
+    (size,) int64 ndarray
+        Row of each in the other tree; -1 where it has none.
+    """
+    level, coords = tree.voxels()
+    return Atlas([other]).find(level.astype(np.int64), coords)
+
+
+def _distinct(planes: np.ndarray, plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Planes that are used, each once, as `Occluders` has them."""
+    used = planes >= 0
+    table, row = np.unique(plane[planes[used]].reshape(-1, 5), axis=0, return_inverse=True)
+    out = np.full(planes.shape, -1, np.int32)
+    out[used] = row.reshape(-1)
+    return out, table

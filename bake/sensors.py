@@ -14,6 +14,9 @@ from ..tree import harmonics
 from . import warp
 from .paths import GRAZING
 
+NOTHING = np.zeros((0, 1, 3))
+"""No mixtures to watch."""
+
 
 class Sensor(Protocol):
     """Sample, density and response of one kind of measure.
@@ -22,12 +25,12 @@ class Sensor(Protocol):
     ----------
     responses : int
         Numbers for each point.
-    watched : (1 + keys + functions, 3) float64 ndarray or None
-        Mixture of local light, suns and sky whose noise is wanted, in the first response.
+    watched : (w, 1 + keys + functions, 3) float64 ndarray
+        Mixtures of local light, suns and sky whose noise is wanted, in the first response; often none.
     """
 
     responses: int
-    watched: np.ndarray | None
+    watched: np.ndarray
 
     def sample(self, rows: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Directions to look in.
@@ -83,13 +86,13 @@ class HarmonicsSensor:
 
     Parameters
     ----------
-    watched : (1 + keys + functions, 3) float64 ndarray, optional
+    watched : (w, 1 + keys + functions, 3) float64 ndarray
         As in `Sensor`; the first response is the mean over directions, but for a factor.
     """
 
     responses = harmonics.COUNT
 
-    def __init__(self, watched: np.ndarray | None = None) -> None:
+    def __init__(self, watched: np.ndarray = NOTHING) -> None:
         self.watched = watched
 
     def sample(self, rows: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -157,7 +160,7 @@ class SurfaceSensor:
         Unit normals of all points.
     """
 
-    responses, watched = 1, None
+    responses, watched = 1, NOTHING
 
     def __init__(self, normal: np.ndarray) -> None:
         self._normal = normal

@@ -130,14 +130,19 @@ def with_sky(snapshot: Snapshot, sky: str) -> tuple[Snapshot, str]:
     if sky == "harmonics":
         return snapshot, "harmonics"
     if sky != "scene":
-        radiance = numbers(sky, "--sky", (1, 3), "scene, harmonics")
-        if (radiance < 0).any():
-            raise SettingsError(f"--sky {sky}: radiance cannot be negative")
-        if (radiance > np.finfo(np.float32).max).any():
-            raise SettingsError(f"--sky {sky}: radiance must be a number of single precision")
-        uniform = np.broadcast_to(radiance, (1, 1, 3)).astype(np.float32)
+        uniform = np.broadcast_to(_radiance(sky), (1, 1, 3)).astype(np.float32)
         snapshot = dataclasses.replace(snapshot, sky=uniform)
     return snapshot, "fixed" if (snapshot.sky > 0).any() else "none"
+
+
+def _radiance(sky: str) -> np.ndarray:
+    """(1,) or (3,) radiance of a uniform sky."""
+    radiance = numbers(sky, "--sky", (1, 3), "scene, harmonics")
+    if (radiance < 0).any():
+        raise SettingsError(f"--sky {sky}: radiance cannot be negative")
+    if (radiance > np.finfo(np.float32).max).any():
+        raise SettingsError(f"--sky {sky}: radiance must be a number of single precision")
+    return radiance
 
 
 def sun_keys(snapshot: Snapshot, sun: str) -> SunDirections:
@@ -166,6 +171,12 @@ def sun_keys(snapshot: Snapshot, sun: str) -> SunDirections:
         return own
     if sun == "none":
         return SunDirections()
+    diameter, toward = own.diameter[0] if len(own.diameter) else 0.0, _toward(sun)
+    return SunDirections(toward, np.full(len(toward), diameter, np.float32))
+
+
+def _toward(sun: str) -> np.ndarray:
+    """(n, 3) float32 unit vectors to suns that are not the scene's own."""
     if sun == "hemisphere":
         toward = hemisphere(HEMISPHERE_KEYS)
     elif sun.startswith("arc:"):
@@ -173,9 +184,33 @@ def sun_keys(snapshot: Snapshot, sun: str) -> SunDirections:
     else:
         toward = numbers(sun, "--sun", (3,), "scene, none, hemisphere, arc:FILE")[None]
     _check_count(len(toward), sun)
-    diameter = own.diameter[0] if len(own.diameter) else 0.0
-    toward = unit(toward, f"--sun {sun}").astype(np.float32)
-    return SunDirections(toward, np.full(len(toward), diameter, np.float32))
+    return unit(toward, f"--sun {sun}").astype(np.float32)
+
+
+def check_words(settings: Settings) -> None:
+    """Refuse what no scene makes right, before one is read.
+
+    Parameters
+    ----------
+    settings : Settings
+        What was asked for.
+
+    Raises
+    ------
+    SettingsError
+        A word for the sky or the sun is not understood, a file of suns cannot be read, or a size is not a power of two.
+    """
+    if settings.sky not in ("scene", "harmonics"):
+        _radiance(settings.sky)
+    if settings.sun not in ("scene", "none"):
+        _toward(settings.sun)
+    _check_finest(settings.finest)
+
+
+def _check_finest(finest: float) -> None:
+    """Refuse sizes that are no power of two; 0 is none."""
+    if finest and not (math.isfinite(finest) and finest > 0 and math.frexp(finest)[0] == 0.5):
+        raise SettingsError(f"--finest {finest}: use a power of two, such as 0.25, 0.5 or 1")
 
 
 def _check_count(count: int, sun: str) -> None:
@@ -311,10 +346,9 @@ def choose_grid(corners: np.ndarray, origin: np.ndarray, finest: float, levels: 
         The size is not a power of two, or far from the scene's own scale.
     """
     grid = lattice.choose(corners, levels, tuple(origin))
+    _check_finest(finest)
     if not finest:
         return grid
-    if not (math.isfinite(finest) and finest > 0 and math.frexp(finest)[0] == 0.5):
-        raise SettingsError(f"--finest {finest}: use a power of two, such as 0.25, 0.5 or 1")
     levels = 1 + math.ceil(math.log(grid.first_size / 2 / finest, lattice.BRANCH)) if finest < grid.first_size else 1
     levels = max(levels, 1)
     if levels > MOST_LEVELS or finest > COARSEST * grid.first_size:

@@ -16,7 +16,7 @@ from ..tree import harmonics, interpolate
 from ..tree.blend import ENOUGH, blend, clamp
 from ..tree.stencil import taps
 from ..tree.topology import Topology
-from . import fit, fit_error, reference
+from . import fit, fit_error, receivers, reference
 from .gather import Effort
 from .lamps import LUMINANCE
 from .measured import Measured, functions, split, stack
@@ -70,6 +70,22 @@ class Seen:
             Copies.
         """
         return Seen(self.at.take(rows), self.light[:, rows])
+
+    @classmethod
+    def none(cls, functions: int) -> Seen:
+        """See nothing.
+
+        Parameters
+        ----------
+        functions : int
+            Functions of light that would be seen.
+
+        Returns
+        -------
+        Seen
+            No receivers.
+        """
+        return cls(receivers.none(), np.zeros((len(HALVES), 0, functions, 3), np.float32))
 
     def plus(self, other: Seen) -> Seen:
         """These and others.
@@ -139,7 +155,7 @@ def trace(scene: Scene, at: Receivers, effort: Effort, progress: Callable[[float
     return Seen(at, np.stack(halves))
 
 
-def fitted(scene: Scene, state: State, threads: int) -> np.ndarray:
+def fitted(scene: Scene, state: State, judge: Judge, threads: int) -> np.ndarray:
     """Fit the data points of a cell to what its receivers see.
 
     Parameters
@@ -148,6 +164,8 @@ def fitted(scene: Scene, state: State, threads: int) -> np.ndarray:
         Says what is modelled; every transport has its own noise.
     state : State
         The cell.
+    judge : Judge
+        Errors count relative to the light of its mean view.
     threads : int
         As in `Effort`.
 
@@ -157,7 +175,7 @@ def fitted(scene: Scene, state: State, threads: int) -> np.ndarray:
         Irradiance harmonics. Receivers whose neighbourhood reaches into other cells have no say: their data
         points are not known here.
     """
-    use, system = _system(state)
+    use, system = _system(state, judge)
     if not len(use) or not state.measured.light.shape[1]:
         return state.measured.light
     light, parts = split(scene, state.measured.light), []
@@ -185,7 +203,7 @@ def squared_errors(state: State, judge: Judge, threads: int) -> tuple[np.ndarray
     noise : (n,) float32 ndarray
         Squared noise of the light at the receiver, relative likewise: it says how far to trust `squared`.
     """
-    use, system = _system(state)
+    use, system = _system(state, judge)
     stored = _views(np.moveaxis(state.measured.light, 1, 2), judge)
     stored, halves = np.ascontiguousarray(np.moveaxis(stored, 2, 1)), _views(state.seen.light, judge)
     if len(use):
@@ -321,8 +339,13 @@ def confidence(state: State) -> np.ndarray:
     return interpolate.weigh(state.data, state.seen.at.position, state.seen.at.normal)[1].sum(axis=1)
 
 
-def _system(state: State) -> tuple[np.ndarray, fit.System | None]:
-    """Receivers with a say, and how they see the data points."""
+def _system(state: State, judge: Judge) -> tuple[np.ndarray, fit.System | None]:
+    """Receivers with a say, and how they see the data points.
+
+    They count by the inverse square of the light that data points bring there: what a bright place is wrong by must not
+    be made up for by a dark one beside it. Their own light would do worse, as those that look dark by chance would
+    count more.
+    """
     at, data = state.seen.at, state.data
     row, weight = interpolate.weigh(data, at.position, at.normal)
     total, reached = weight.sum(axis=1), np.zeros(len(weight))
@@ -332,7 +355,12 @@ def _system(state: State) -> tuple[np.ndarray, fit.System | None]:
     if not len(use):
         return use, None
     basis = harmonics.basis(at.normal[use].astype(np.float64))
-    return use, fit.System(len(data.valid), row[use], weight[use] / total[use, None], basis, np.ones(len(use)))
+    weight = weight[use] / total[use, None]
+    plain = fit.System(len(data.valid), row[use], weight, basis, np.ones(len(use)))
+    bright = fit.evaluate(plain, mean_view(state.measured.light, judge))[:, 0, 0].astype(np.float64)
+    typical = float((bright * at.area[use]).sum() / at.area[use].sum())
+    counts = 1 / np.maximum(bright**2 + (DARK * typical) ** 2, 1e-30) if typical > 0 else np.ones(len(use))
+    return use, fit.System(len(data.valid), row[use], weight, basis, counts)
 
 
 def _fit(system: fit.System, traced: np.ndarray, halves: np.ndarray, threads: int) -> np.ndarray:

@@ -118,6 +118,23 @@ class Grid:
         """
         return (np.asarray(coords) + 0.5) * np.asarray(self.voxel_size(np.asarray(level)))[..., None]
 
+    def voxels_at(self, level: int, p_local: np.ndarray) -> np.ndarray:
+        """Return the voxels of a level that hold points.
+
+        Parameters
+        ----------
+        level : int
+            The level.
+        p_local : (n, 3) float64
+            Points relative to the origin [m].
+
+        Returns
+        -------
+        (n, 3) int64
+            Global voxel coordinates.
+        """
+        return np.floor(p_local / float(self.voxel_size(level))).astype(np.int64)
+
     def cells_of(self, bounds: np.ndarray) -> np.ndarray:
         """Return every world cell that a box overlaps; a box that only touches a cell's lower border is not in it.
 

@@ -8,8 +8,8 @@ import json
 import numpy as np
 import pytest
 from command_line import yard
+from gi_volumes.bake import cell_job, job, radiosity
 from gi_volumes.bake import check as checking
-from gi_volumes.bake import job, radiosity
 from gi_volumes.bake.check import Check
 from gi_volumes.bake.gather import Effort
 from gi_volumes.bake.scene import prepare
@@ -107,7 +107,7 @@ def test_checks_of_cells_are_joined():
 def bake(target, settings=SETTINGS) -> job.Outcome:
     """Bake the yard by the cache, small as it is."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(job, "WORTH", 0)
+        patch.setattr(cell_job, "WORTH", 0)
         return job.bake(yard(), target, settings)
 
 
@@ -122,7 +122,7 @@ def test_the_summary_says_what_the_check_found(tmp_path):
 def test_where_the_cache_is_too_far_off_the_bake_is_that_of_paths(tmp_path, monkeypatch):
     around = job.radiosity.around
     bake(tmp_path / "paths", dataclasses.replace(SETTINGS, method="paths"))
-    monkeypatch.setattr(job.radiosity, "around", lambda *given: scaled(around(*given), 5.0))
+    monkeypatch.setattr(cell_job.radiosity, "around", lambda *given: scaled(around(*given), 5.0))
     outcome = bake(tmp_path / "cache")
     assert ["surface cache is too far off" in text for text in outcome.warnings].count(True) == outcome.cells
     points = np.random.default_rng(1).uniform((0, 0, 0), (8, 8, 3), (500, 3))

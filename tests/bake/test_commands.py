@@ -48,6 +48,19 @@ def python(*words: object, **options) -> subprocess.CompletedProcess:
     return subprocess.run(command, capture_output=True, text=True, stdin=subprocess.DEVNULL, timeout=120, **options)
 
 
+@pytest.mark.parametrize("words", [["--sky", "blue"], ["--sun", "up"], ["--sun", "arc:no.txt"], ["--finest", "0.3"]])
+@pytest.mark.parametrize("command", ["bake", "reference"])
+def test_words_that_no_scene_makes_right_are_refused_before_one_is_read(command, words, tmp_path):
+    if command == "reference" and words[0] == "--finest":
+        pytest.skip("the reference has no voxels")
+    np.save(tmp_path / "p.npy", np.zeros((1, 3)))
+    np.save(tmp_path / "n.npy", np.eye(3)[:1])
+    points = ["--points", tmp_path / "p.npy", "--normals", tmp_path / "n.npy"] if command == "reference" else []
+    said = call(command, "no_such_scene.blend", "-o", tmp_path / "out", *points, *words)
+    assert said.code == 1
+    assert said.reason.startswith(words[0])
+
+
 def test_a_limit_on_time_and_what_is_kept_for_later_exclude_each_other(tmp_path):
     said = call("bake", "level.giv", "-o", tmp_path / "out", "--minutes", "1", "--incremental")
     assert said.reason.startswith("--minutes and --incremental: one or the other")

@@ -8,11 +8,11 @@ import build_scenes
 import numpy as np
 import pytest
 from command_line import cells_only
-from gi_volumes.bake import changes, job, memory
-from gi_volumes.bake.again import Again, settled
+from gi_volumes.bake import cell_job, changes, job, memory
+from gi_volumes.bake.again import Again, remember, settled
 from gi_volumes.bake.blocks import Blocks
 from gi_volumes.bake.gather import Effort
-from gi_volumes.bake.refine import Refinement, Target
+from gi_volumes.bake.refine import Refinement, Target, rows_in
 from gi_volumes.bake.scene import prepare
 from gi_volumes.bake.settings import Settings, choose_grid, model
 from gi_volumes.bake.snapshot import Channel, LightKind, Material
@@ -106,13 +106,22 @@ def differences(one, other, transport="local") -> np.ndarray:
     return np.sort(np.abs(a - b) / np.maximum(b, 0.1 * b.mean()))
 
 
+def assert_within_what_storing_changes(target, whole) -> None:
+    """Two trees may differ by voxels whose error is close to the target; light in the room must not."""
+    off, room = differences(target, whole), ((0.5, 0.5, 0.1), (7.5, 6.0, 3.1))
+    bound = memory.load(target, (0, 0), grid_of(target), rules_of(target)).bounds["local"]
+    assert off[int(0.99 * len(off))] < bound
+    found, truth = (seen(part, "local", *room).mean() for part in (target, whole))
+    assert found == pytest.approx(truth, rel=0.01)
+
+
 def test_a_bake_that_remembers_is_the_bake_that_does_not(first, tmp_path):
     full(house(), tmp_path)
     assert all(equal(arrays(first, cell), arrays(tmp_path, cell)) for cell in CELLS)
 
 
 def test_what_is_the_same_is_copied(first, again, monkeypatch):
-    monkeypatch.setattr(job, "_write", None)
+    monkeypatch.setattr(cell_job, "_write", None)
     target, outcome = again(house(lamp=1 + 1e-6))
     assert outcome.kept == outcome.data_points
     assert all(equal(arrays(first, cell), arrays(target, cell)) for cell in CELLS)
@@ -142,8 +151,7 @@ def test_a_dimmed_lamp_changes_local_light_alone(first, again, tmp_path):
     assert equal(arrays(first, (1, 0)), arrays(target, (1, 0)))
     old, new = (memory.load(part, (0, 0), grid_of(part), rules_of(part)) for part in (first, target))
     assert np.array_equal(old.measured.light[:, 1:], new.measured.light[:, 1:])
-    off = differences(target, full(dimmed, tmp_path / "full"))
-    assert off[int(0.9 * len(off))] < 0.02
+    assert_within_what_storing_changes(target, full(dimmed, tmp_path / "full"))
     assert outcome.kept < outcome.data_points
 
 
@@ -151,9 +159,8 @@ def test_much_less_light_decides_on_the_tree_anew(again, tmp_path):
     dimmed = house(lamp=0.4)
     target, whole = again(dimmed)[0], full(dimmed, tmp_path / "full")
     found, truth = (folder.read_cell(part, (0, 0)).topology for part in (target, whole))
-    assert np.array_equal(found.nodes, truth.nodes)
-    off = differences(target, whole)
-    assert off[int(0.99 * len(off))] < 0.05
+    assert abs(found.size - truth.size) < 0.02 * truth.size
+    assert_within_what_storing_changes(target, whole)
 
 
 def grid_of(target):
@@ -168,8 +175,7 @@ def rules_of(target) -> str:
 def test_small_changes_do_not_add_up_unseen(again, tmp_path):
     for step in range(1, 9):
         target, _ = again(house(lamp=1.02**step))
-    off = differences(target, full(house(lamp=1.02**8), tmp_path / "full"))
-    assert off[int(0.9 * len(off))] < 0.03
+    assert_within_what_storing_changes(target, full(house(lamp=1.02**8), tmp_path / "full"))
 
 
 def test_the_number_of_threads_changes_no_byte(first, tmp_path):
@@ -253,7 +259,7 @@ def test_deciding_anew_where_nothing_has_changed_gives_the_same_state(error):
     made = Refinement(scene, cell, judge, target, None)
     truth = made.run()
     causes = changes.causes(snapshot, scene, judge)
-    known = job.remember(made, causes, "rules", None)
+    known = remember(made, causes, "rules", None)
     past = changes.compare(known, scene, grid, causes, effort, 32)
     everything = Blocks([(0, truth.tree.voxels()[1][: truth.tree.grid_count])])
     past = dataclasses.replace(past, decide=everything)
@@ -301,17 +307,19 @@ def test_another_hue_of_the_same_luminance_is_seen(tmp_path):
 
 def test_suns_that_change_places_are_seen(tmp_path):
     again, whole, _ = both(simple(), simple(suns=((-1, 0, 1), (1, 0, 1))), tmp_path)
+    cells = [folder.read_cell(target, (0, 0)) for target in (again, whole)]
+    row = rows_in(*(cell.topology for cell in cells))
+    assert (row >= 0).mean() > 0.97
     for number in range(2):
-        found, truth = (
-            folder.read_cell(target, (0, 0)).payloads["sun"].values()[:, number] for target in (again, whole)
-        )
+        found, truth = (cell.payloads["sun"].values()[:, number] for cell in cells)
+        found, truth = found[row >= 0], truth[row[row >= 0]]
         assert np.sqrt(((found - truth) ** 2).mean()) < 0.2 * np.sqrt((truth**2).mean())
 
 
 def test_another_strength_of_the_sun_decides_on_the_tree_anew(tmp_path):
     again, whole, _ = both(simple(strength=(1e-4, 1e-4)), simple(strength=(100.0, 100.0)), tmp_path)
     found, truth = (folder.read_cell(target, (0, 0)) for target in (again, whole))
-    assert np.array_equal(found.topology.nodes, truth.topology.nodes)
+    assert abs(found.topology.size - truth.topology.size) < 0.01 * truth.topology.size
     assert found.planes.shade == pytest.approx(truth.planes.shade, abs=0.05)
 
 
@@ -329,7 +337,7 @@ def test_a_wall_just_beyond_the_border_hides_light(tmp_path):
 
 
 def test_the_cache_of_a_cell_is_used_again(tmp_path, monkeypatch):
-    monkeypatch.setattr(job, "WORTH", 0)
+    monkeypatch.setattr(cell_job, "WORTH", 0)
     settings = dataclasses.replace(SETTINGS, method="cache", bounces=32)
     again, whole, outcome = both(house(), house(moved(2.0), other=0.5), tmp_path, settings)
     off = np.sqrt((differences(again, whole) ** 2).mean())

@@ -308,7 +308,9 @@ def test_a_black_sky_of_functions_is_judged_as_a_white_one():
 def test_without_time_every_cell_is_an_early_look_and_the_next_bake_goes_on(row, row_baked, tmp_path):
     result = succeed("bake", row, "-o", tmp_path, *QUICK, "--minutes", "1e-9")
     assert f"time was too short for {CELLS} of {CELLS} cells (0,0/1,0/2,0)" in result["warnings"][0]
-    assert 0 < result["data_points"] <= sum(cell["data_points"] for cell in succeed("info", row.parent / "whole")["cells"])
+    assert (
+        0 < result["data_points"] <= sum(cell["data_points"] for cell in succeed("info", row.parent / "whole")["cells"])
+    )
     assert not any("not baked yet" in text for text in result["warnings"])
     assert len(call("verify", tmp_path, "--json").object["defects"]) == CELLS
     succeed("bake", row, "-o", tmp_path, *QUICK)

@@ -30,21 +30,21 @@ def cell():
 
 def sampling(scene, samples: int, seed: int = 0, aim: float = 0.0) -> Sampling:
     """All light counts alike."""
-    return Sampling(Effort(samples, 4, seed, 1), np.ones((measured.functions(scene), 3)) * LUMINANCE, aim)
+    return Sampling(Effort(samples, 4, seed, 1), np.ones((1, measured.functions(scene), 3)) * LUMINANCE, aim)
 
 
 def known(noise: float, valid: bool = True) -> Measured:
     """Two voxels of the first level, the second one without noise."""
     coords = np.array([[0, 0, 0], [1, 0, 0]])
     light = np.ones((2, 1, 9, 3), np.float32)
-    values = np.full(2, valid), light, np.array([noise, 0], np.float32)
+    values = np.full(2, valid), light, np.array([[noise], [0]], np.float32), np.full(2, 256, np.int32)
     return Measured(np.zeros(2, np.uint8), coords, np.zeros((2, 3), np.int8), *values)
 
 
 def counts(parent: Measured | None, samples: int = 256, aim: float = 0.1) -> list[int]:
     """Paths of a child of each parent, and of a voxel that has none."""
     coords = np.array([[1, 2, 3], [5, 2, 3], [9, 2, 3]])
-    wanted = Sampling(Effort(samples), np.array([[1.0, 0.0, 0.0]]), aim)
+    wanted = Sampling(Effort(samples), np.array([[[1.0, 0.0, 0.0]]]), aim)
     return measured._counts(parent, np.ones(3, np.uint8), coords, wanted).tolist()
 
 
@@ -54,7 +54,7 @@ def test_noise_is_never_far_above_and_hardly_below_what_seeds_scatter_by(cell, s
     runs = [measured.measure(scene, grid, tree, sampling(scene, samples, seed)) for seed in range(SEEDS)]
     valid = runs[0].valid
     light = np.stack([np.einsum("nfc,c->n", run.light[:, :, 0], LUMINANCE) for run in runs])[:, valid]
-    said = np.sqrt((np.stack([run.noise for run in runs])[:, valid] ** 2).mean())
+    said = np.sqrt(((np.stack([run.noise[:, 0] for run in runs])[:, valid] * light) ** 2).mean())
     scatter = np.sqrt(light.var(axis=0, ddof=1).mean())
     assert 0.4 * said < scatter < 1.1 * said
 

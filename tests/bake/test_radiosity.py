@@ -8,7 +8,7 @@ import build_scenes
 import numpy as np
 import pytest
 from command_line import cells_only
-from gi_volumes.bake import discovery, job, parallel, radiosity, reference
+from gi_volumes.bake import cell_job, discovery, job, parallel, radiosity, reference
 from gi_volumes.bake.gather import Effort, gather
 from gi_volumes.bake.parallel import CancelledError
 from gi_volumes.bake.scene import Model, Scene, SunDirections, prepare
@@ -235,7 +235,7 @@ QUICK = Settings(samples=64, bounces=16, error=0.3, method="cache")
 @pytest.fixture
 def always(monkeypatch):
     """Caches also in small bakes."""
-    monkeypatch.setattr(job, "WORTH", 0)
+    monkeypatch.setattr(cell_job, "WORTH", 0)
 
 
 @pytest.mark.usefixtures("always")

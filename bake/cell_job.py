@@ -368,7 +368,11 @@ def _part_of(show: Callable[[float], bool], attempt: int) -> Callable[[float], b
 
 def _write(work: Work, cell: tuple[int, int], refined: State, limit: int = 0, early: bool = False) -> int:
     """Fit the data of a cell and write its files; their bytes."""
-    light = fitted(work.scene, refined, work.target.effort.threads) if work.settings.fit else refined.measured.light
+    light = (
+        fitted(work.scene, refined, work.judge, work.target.effort.threads)
+        if work.settings.fit
+        else refined.measured.light
+    )
     measured, data = refined.measured, refined.data
     corner = np.array([*cell, 0]) * work.grid.cell_size
     dim = shade(refined, light, work.judge) if light.shape[1] else 1.0
