@@ -33,8 +33,8 @@ SHEET_WIDTH = 190
 HARDLY = 1e-3
 """Share of all light below which a transport is nobody's concern in a picture."""
 
-COLOURS = 128
-"""In the sheet's palette."""
+COLOURS = 256
+"""In the sheet's palette; dithered, as bands would look like faults of a bake."""
 
 
 @dataclass(frozen=True)
@@ -205,7 +205,8 @@ def write_sheet(path: Path, strips: list[np.ndarray]) -> None:
     height = SHEET_WIDTH * SIZE[1] // SIZE[0]
     small = [Image.fromarray(one).resize((3 * SHEET_WIDTH, height), Image.Resampling.BOX) for one in strips]
     sheet = Image.fromarray(np.concatenate([np.asarray(one) for one in small]))
-    sheet.quantize(COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)
+    palette = sheet.quantize(COLOURS)
+    sheet.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG).save(path, optimize=True)
 
 
 def main() -> None:
