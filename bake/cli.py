@@ -17,9 +17,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TextIO
 
+import numpy as np
+
 from ..tree import container, verify, world
 from ..tree.topology import MAX_POINTS
-from . import job, reference, snapshot_file
+from . import job, reference, snapshot_file, viewpoint
 from .arrays import check_output, one_line, read_points, write_array
 from .place import SNAPSHOT_NAME, check_target, scene_defects
 from .progress import Progress
@@ -38,7 +40,7 @@ from .snapshot import Snapshot, SnapshotError
 EXPECTED = (SnapshotError, SettingsError, container.FileError, OSError, ValueError, MemoryError)
 """Errors that are the input's fault: one line, no traceback."""
 
-MAY_BE_NEGATIVE = ("--sun", "--sky", "--cells", "--finest")
+MAY_BE_NEGATIVE = ("--sun", "--sky", "--cells", "--finest", "--eye", "--target")
 """Options whose value may begin with a minus, which would otherwise pass for an option."""
 
 MOST_SAMPLES = 1 << 20
@@ -229,11 +231,17 @@ def _add_compare(commands) -> None:
     command.add_argument("folder", type=_path, metavar="DIR")
     command.add_argument("-o", "--output", type=_path, required=True, metavar="IMAGE", help=".png or .exr")
     command.add_argument("--camera", help="its name; the scene's active camera without it")
+    text = "stand here instead, in metres of the scene's world, z up; together with --target"
+    command.add_argument("--eye", type=_place, metavar="x,y,z", help=text)
+    command.add_argument("--target", type=_place, metavar="x,y,z", help="what is in the middle of the picture then")
+    text = f"horizontal field of view from --eye ({viewpoint.FIELD_OF_VIEW:g})"
+    command.add_argument("--fov", type=_field_of_view, metavar="DEGREES", help=text)
     command.add_argument("--size", type=_size, default=(480, 270), metavar="WxH", help="of each of the three pictures")
     command.add_argument("--samples", type=_samples, default=256, help="paths per pixel of the reference (256)")
     command.add_argument("--transport", choices=("local", "sun", "sky", "all"), default="all")
     command.add_argument("--threads", type=_natural, default=0)
     command.add_argument("--progress", choices=("text", "json"), default="text")
+    command.set_defaults(refuse=command.error)
 
 
 def _add_points(command: argparse.ArgumentParser) -> None:
@@ -338,8 +346,12 @@ def _run_reference(options, extract: Extract, progress: Progress) -> dict:
 def _run_compare(options, extract: Extract, progress: Progress) -> dict:
     from . import compare
 
+    try:
+        camera = viewpoint.choose(options.camera, options.eye, options.target, options.fov)
+    except SettingsError as wrong:
+        options.refuse(str(wrong))
     check_output(options.output)
-    view = compare.View(options.camera, options.size, options.samples, options.transport, options.threads)
+    view = compare.View(camera, options.size, options.samples, options.transport, options.threads)
     return compare.compare(options.folder, options.output, view, progress)
 
 
@@ -459,6 +471,24 @@ def _cells(text: str) -> list[tuple[int, int]]:
     if any(len(pair) != 2 for pair in pairs):
         raise argparse.ArgumentTypeError(f"{text}: write cells as i,j/i,j")
     return pairs
+
+
+def _place(text: str) -> np.ndarray:
+    try:
+        return numbers(text, "a place", (3,))
+    except SettingsError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a place: write three numbers as x,y,z") from None
+
+
+def _field_of_view(text: str) -> float:
+    """Degrees that a flat picture can hold."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < 180:
+        raise argparse.ArgumentTypeError(f"{text!r} is not an angle above 0 and below 180 degrees")
+    return value
 
 
 def _size(text: str) -> tuple[int, int]:

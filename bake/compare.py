@@ -1,6 +1,6 @@
 """A bake seen by a camera: its irradiance beside the path-traced one, and their difference.
 
-Comes in: a bake's folder and a camera of its snapshot. Goes out: a picture and figures. Surfaces are shown by
+Comes in: a bake's folder and a camera. Goes out: a picture and figures. Surfaces are shown by
 the irradiance they receive, not by their colours, so that nothing hides an error.
 """
 
@@ -29,9 +29,16 @@ LAYERS = 16
 
 @dataclass(frozen=True)
 class View:
-    """What to look at and how well: camera name or None, (width, height), paths per pixel, transport, threads."""
+    """What to look at and how well.
 
-    camera: str | None = None
+    camera : a camera, the name of one of the scene's, or None for the scene's first
+    size : (width, height) [px]
+    samples : paths per pixel
+    transport : "local", "sun", "sky" or "all"
+    threads : 0 for every core
+    """
+
+    camera: Camera | str | None = None
     size: tuple[int, int] = (480, 270)
     samples: int = 256
     transport: str = "all"
@@ -153,13 +160,15 @@ def camera_rays(camera: Camera, size: tuple[int, int], scene_origin: np.ndarray)
     return start.astype(np.float32), direction.astype(np.float32)
 
 
-def _camera(snapshot: Snapshot, name: str | None) -> Camera:
-    """The camera by that name, or the first."""
+def _camera(snapshot: Snapshot, name: Camera | str | None) -> Camera:
+    """The camera itself, that by its name, or the first."""
+    if isinstance(name, Camera):
+        return name
     for camera in snapshot.cameras:
         if name is None or camera.name == name:
             return camera
     if name is None:
-        raise SettingsError("the scene has no camera to look through; add one and bake again")
+        raise SettingsError("the scene has no camera to look through; say where from with --eye and --target")
     known = ", ".join(repr(camera.name) for camera in snapshot.cameras) or "none"
     raise SettingsError(f"--camera {name}: the scene has no such camera; cameras: {known}")
 

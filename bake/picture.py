@@ -71,26 +71,42 @@ def check_path(path: Path) -> None:
         raise SettingsError(f"{path}: write pictures as .png or .exr")
 
 
-def _write_png(path: Path, baked: np.ndarray, traced: np.ndarray, covered: np.ndarray) -> None:
-    from PIL import Image, ImageDraw
+def panels(baked: np.ndarray, traced: np.ndarray, covered: np.ndarray) -> np.ndarray:
+    """Make three pictures beside each other: baked, path traced, their difference.
 
+    Parameters
+    ----------
+    baked, traced : (h, w, 3) float32 ndarray
+        Linear Rec.709 [W/m2].
+    covered : (h, w) bool ndarray
+        Where there is a surface.
+
+    Returns
+    -------
+    (h, 3 w, 3) uint8 ndarray
+        sRGB, as bright as suits what was traced; the difference is white where there is none.
+    """
     seen = (traced @ LUMINANCE)[covered]
     bright = float(np.quantile(seen, QUANTILE)) if seen.size else 1.0
     mean = float(seen.mean()) if seen.size else 1.0
     scale = BRIGHT / max(bright, 1e-30)
-    panels = [
+    shown = [
         _display(baked * scale),
         _display(traced * scale),
         _signed((baked - traced) @ LUMINANCE / max(mean, 1e-30)),
     ]
-    height, width = covered.shape
-    sheet = np.full((height + CAPTION_HEIGHT, 3 * width, 3), BACKGROUND, np.uint8)
-    for number, panel in enumerate(panels):
-        sheet[CAPTION_HEIGHT:, number * width : (number + 1) * width][covered] = panel[covered]
+    return np.concatenate([np.where(covered[..., None], one, np.uint8(BACKGROUND)) for one in shown], axis=1)
+
+
+def _write_png(path: Path, baked: np.ndarray, traced: np.ndarray, covered: np.ndarray) -> None:
+    from PIL import Image, ImageDraw
+
+    below = panels(baked, traced, covered)
+    sheet = np.concatenate([np.full((CAPTION_HEIGHT, *below.shape[1:]), BACKGROUND, np.uint8), below])
     image = Image.fromarray(sheet)
     draw = ImageDraw.Draw(image)
     for number, caption in enumerate(CAPTIONS):
-        draw.text((number * width + 4, 3), caption, fill=(220, 220, 220))
+        draw.text((number * covered.shape[1] + 4, 3), caption, fill=(220, 220, 220))
     buffer = io.BytesIO()
     image.save(buffer, "PNG")
     write_bytes_atomically(path, buffer.getvalue())

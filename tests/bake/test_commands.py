@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -269,6 +270,38 @@ def test_compare_shows_a_scene_in_the_dark(tmp_path):
 def test_compare_names_the_cameras_that_there_are(baked, tmp_path):
     said = call("compare", baked, "-o", tmp_path / "seen.png", "--camera", "below")
     assert said.reason == "--camera below: the scene has no such camera; cameras: 'above'"
+
+
+def test_compare_looks_from_anywhere_into_a_scene_without_a_camera(tmp_path):
+    blind = stored(tmp_path, dataclasses.replace(yard(), cameras=()))
+    succeed("bake", blind, "-o", tmp_path / "out", *QUICK)
+    words = ("compare", tmp_path / "out", "-o", tmp_path / "seen.png", "--size", "6x4", "--samples", "4")
+    assert call(*words).reason.endswith("say where from with --eye and --target")
+    assert succeed(*words, "--eye", "-30,12,20", "--target", "12,12,0", "--fov", "5")["pixels"] == 24
+    assert succeed(*words, "--eye", "12,12,20", "--target", "-30,12,20")["pixels"] == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["--eye", "1,2,3"], "--eye and --target: give both, or neither"),
+        (["--target", "1,2,3"], "--eye and --target: give both, or neither"),
+        (["--fov", "60"], "--fov: only together with --eye and --target; cameras of the scene have their own"),
+        (["--eye", "1,2,3", "--target", "1,2,3.0"], "--eye and --target: they are one point, which gives no direction"),
+        (["--eye", "1,2,3", "--target", "0,0,0", "--camera", "above"], "--camera: not together with --eye"),
+        (["--eye", "1,2,3", "--target", "0,0,1e30"], "--eye and --target: at most 1e+09 m from the origin"),
+        (["--eye", "1,2", "--target", "0,0,0"], "argument --eye: '1,2' is not a place: write three numbers as x,y,z"),
+        (["--eye", "1,2,3", "--target", "0,nan,0"], "argument --target: '0,nan,0' is not a place"),
+        (["--eye", "1,2,3", "--target", "0,0,0", "--fov", "180"], "argument --fov: '180' is not an angle above 0"),
+        (["--eye", "1,2,3", "--target", "0,0,0", "--fov", "wide"], "argument --fov: 'wide' is not an angle above 0"),
+    ],
+)
+def test_compare_says_what_is_wrong_with_a_place_to_look_from(tmp_path, monkeypatch, words, reason):
+    monkeypatch.chdir(tmp_path)
+    said = call("compare", "out", "-o", "seen.png", *words)
+    assert (said.code, said.out) == (2, "")
+    assert said.err.splitlines()[-1].startswith(f"gi_volumes compare: error: {reason}")
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
