@@ -26,9 +26,11 @@ APART = 1.5
 """Times more samples than the ladder's end, from which on the last run says how errors fall."""
 
 CACHE_SEEDS = 1, 2
+OTHER_SEED = 100
+"""Between Cycles' seeds for one number of samples and the next: runs must not share samples."""
 
-TIMED = 64
-"""Paths of the points on which the cache and paths are timed against each other."""
+TIMED, TIMINGS = 128, 3
+"""Paths of the points on which the cache and paths are timed against each other, and how often in a round."""
 
 REFERENCE_SEEDS = 1000, 1001
 AXIS_SHARE = 4
@@ -214,7 +216,8 @@ class Comparison:
     def _in_turn(self, ours: list[tuple[Callable, tuple]], cycles: list[tuple[int, int]]) -> None:
         """Everything of a round in random order, so that a busy minute disturbs no estimator more than others."""
         for seed in range(1, self.repeat + 1):
-            jobs = [*ours, *((self._bake, job) for job in cycles), (self._time, ("cache",)), (self._time, ("paths",))]
+            jobs = [*ours, *((self._bake, job) for job in cycles), *TIMINGS * [(self._time, ("cache",))]]
+            jobs += TIMINGS * [(self._time, ("paths",))]
             jobs += [(self._bake, (function, 1)) for function in sorted({function for function, _ in cycles})]
             for row in np.random.default_rng(seed).permutation(len(jobs)):
                 run, arguments = jobs[row]
@@ -231,7 +234,8 @@ class Comparison:
 
     def _bake(self, function: int, samples: int, seed: int) -> None:
         """Cycles at the judged points."""
-        self.cycles.add((function, samples), *self.bakes.run(self.ours.transports[function], samples, seed))
+        run = self.bakes.run(self.ours.transports[function], samples, seed + OTHER_SEED * samples)
+        self.cycles.add((function, samples), *run)
 
     def _stacked(self, samples: Iterable[int]) -> list[np.ndarray]:
         """Runs of Cycles with so many samples for each function, as ours are."""

@@ -10,6 +10,7 @@ import bpy
 import numpy as np
 from gi_volumes.bake import measured, radiosity
 from gi_volumes.bake.gather import Effort, gather
+from gi_volumes.bake.rays import MISS
 from gi_volumes.bake.scene import Scene, prepare
 from gi_volumes.bake.sensors import HarmonicsSensor, SurfaceSensor
 from gi_volumes.bake.settings import CACHED_BOUNCES, Settings, model
@@ -20,6 +21,9 @@ from gi_volumes.operators import extract
 from gi_volumes.tree import harmonics
 
 AXES = np.concatenate([np.eye(3), -np.eye(3)])
+CLEAR = 0.005
+"""Errors are measured at points that have no surface so near [m]: a few quads of Cycles' across."""
+
 STRETCH, STRETCHES = 64, 16
 """Neighbouring data points, and groups of them, on which paths and the cache are timed against each other."""
 
@@ -40,9 +44,19 @@ class Ours:
         self.scene = prepare(*model(extract.extract(bpy.context), Settings(sun="hemisphere", sky="harmonics")))
         self.grid, self.position, self.key = tree_points(self.scene, points)
         count = len(self.key)
-        self.judged = np.linspace(0, count - 1, min(judged, count)).astype(np.int64)
+        self.judged = self._clear(np.linspace(0, count - 1, min(2 * judged, count)).astype(np.int64), judged)
         starts = np.linspace(0, max(count - STRETCH, 0), STRETCHES).astype(np.int64)
         self.stretches = np.unique((starts[:, None] + np.arange(min(STRETCH, count))).ravel())
+
+    def _clear(self, rows: np.ndarray, count: int) -> np.ndarray:
+        """Some of the points that lie in no surface: there, half of a quad would be behind it for Cycles."""
+        directions = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3), axis=-1).reshape(-1, 3)
+        directions = np.delete(directions, len(directions) // 2, axis=0).astype(np.float32).T
+        origin = np.ascontiguousarray(np.repeat(self.position[:, rows], directions.shape[1], axis=1))
+        ends = np.full(origin.shape[1], CLEAR, np.float32)
+        touches = self.scene.tracer.intersect_opaque(origin, np.tile(directions, len(rows)), ends).triangle != MISS
+        free = rows[~touches.reshape(len(rows), -1).any(axis=1)]
+        return free[np.linspace(0, len(free) - 1, min(count, len(free))).astype(np.int64)]
 
     @property
     def points(self) -> np.ndarray:
