@@ -38,6 +38,7 @@ class Settings:
 
     `bounces` is Cycles' `max_bounces` for every kind of scattering: so many surfaces after the point scatter light
     of lamps, and emission and sky are seen one surface further. `seeds` are independent runs of `samples` each.
+    Paths may end by chance after `sure_bounces`, with -1 never.
     """
 
     samples: int = 64
@@ -46,6 +47,7 @@ class Settings:
     threads: int = 2
     light_tree: bool = True
     caustics: bool = True
+    sure_bounces: int = -1
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,9 @@ TRANSPORTS = {
 "DIRECT" for Cycles, however it was sampled, so that indirect passes of lamps never hold any of it."""
 
 
-def irradiance(points: np.ndarray, normals: np.ndarray, transport: str, settings: Settings | None = None) -> Estimate:
+def irradiance(
+    points: np.ndarray, normals: np.ndarray, transport: str | tuple[Pass, ...], settings: Settings | None = None
+) -> Estimate:
     """Estimate one transport at points of the open scene.
 
     Parameters
@@ -99,8 +103,8 @@ def irradiance(points: np.ndarray, normals: np.ndarray, transport: str, settings
         In world space.
     normals : (n, 3) float64
         Unit length.
-    transport : str
-        A key of `TRANSPORTS`. "sun" is lit by the suns at their own strength.
+    transport : str or tuple of Pass
+        A key of `TRANSPORTS`, or bakes to add up. "sun" is lit by the suns at their own strength.
     settings : Settings, optional
         How Cycles is run.
 
@@ -120,12 +124,12 @@ def irradiance(points: np.ndarray, normals: np.ndarray, transport: str, settings
     """
     settings = settings or Settings()
     points, normals = _checked(points, normals)
-    if transport not in TRANSPORTS:
+    if isinstance(transport, str) and transport not in TRANSPORTS:
         raise ValueError(f"transport is {transport!r}; it must be one of {', '.join(TRANSPORTS)}")
     runs = np.zeros((len(settings.seeds), len(points), 3))
     with Changes() as changes, _quads(points, normals) as atlas:
         _configure(changes, settings)
-        for part in TRANSPORTS[transport]:
+        for part in TRANSPORTS[transport] if isinstance(transport, str) else transport:
             runs += _bake_pass(part, settings.seeds, atlas)[:, : len(points)]
     spread = runs.std(axis=0, ddof=1) if len(runs) > 1 else np.full(runs.shape[1:], np.nan)
     return Estimate(runs.mean(axis=0), spread / np.sqrt(len(runs)), runs)
@@ -157,7 +161,7 @@ def _configure(changes: Changes, settings: Settings) -> None:
         "blur_glossy": 0.0,
         "caustics_reflective": settings.caustics,
         "caustics_refractive": settings.caustics,
-        "min_light_bounces": settings.bounces,
+        "min_light_bounces": settings.bounces if settings.sure_bounces < 0 else settings.sure_bounces,
         "transparent_max_bounces": 64,
         "use_fast_gi": False,
         "film_exposure": 1.0,
