@@ -23,10 +23,10 @@ from .rays import MISS
 from .scene import Scene
 from .sobol import Sampler
 
-__all__ = ["Candidates", "candidates"]
+__all__ = ["Around", "Candidates", "candidates", "judge"]
 
-MOST = 3 << 12
-"""Candidates of a scene: twelve for each of a thousand probes."""
+MOST = 1 << 14
+"""Candidates of a scene: sixteen for each of a thousand probes."""
 
 JUDGED = 1 << 17
 """Places that rays are sent from, at most: a few seconds."""
@@ -38,7 +38,7 @@ CLEARANCE = 1 / 16
 """A place is too close to a surface when that is nearer than this part of the mean distance: it hides too much there.
 In a room 15 cm; places close to everything, in a shelf, are none the less as good as others."""
 
-NARROWEST = 1 / 8
+NARROWEST = 1 / 16
 """Cubes are no smaller than in space this part as wide as half of the whole: cracks and shelves have few candidates."""
 
 FINEST_CUBES, STEPS, OCTAVES = 5, 3, 20

@@ -43,7 +43,9 @@ def density(cosine: np.ndarray, roughness: float) -> np.ndarray:
     """
     squared = roughness**4
     t = (1 + cosine) / 2
-    return np.maximum(cosine, 0) * (squared / (4 * math.pi * _integral(0.5, squared))) / (1 - t + squared * t) ** 2
+    return (
+        np.maximum(cosine, 0) * (squared / (4 * math.pi * float(_integral(0.5, squared)))) / (1 - t + squared * t) ** 2
+    )
 
 
 def share(cosine: np.ndarray, roughness: float) -> np.ndarray:
