@@ -8,6 +8,7 @@ import build_scenes
 import numpy as np
 import pytest
 from gi_volumes.bake import candidates as candidates_module
+from gi_volumes.bake import patches as patches_module
 from gi_volumes.bake import receivers, warp
 from gi_volumes.bake import views as views_module
 from gi_volumes.bake.candidates import candidates
@@ -276,6 +277,32 @@ def test_patches_count_by_what_meets_them_as_rays_from_all_surfaces_do():
     expected = found.weight[inner].sum() / found.weight.sum()
     assert share == pytest.approx(expected, rel=0.02)
     assert share != pytest.approx(9 / 126, rel=0.02)
+
+
+def test_patches_are_thinned_to_equal_weights_and_keep_their_sum(monkeypatch):
+    everything = patches(*street(), EFFORT)
+    monkeypatch.setattr(patches_module, "MOST", 2000)
+    monkeypatch.setattr(patches_module, "SPARE", 16)
+    few = patches(*street(), EFFORT)
+    assert abs(len(few.weight) - 2000) <= 1
+    assert few.weight.sum() == pytest.approx(everything.weight.sum(), rel=0.02)
+    assert np.median(few.weight) == pytest.approx(few.weight.max(), rel=0.2)
+    near = (np.abs(few.start[:2]) < 15).all(axis=0)
+    all_near = (np.abs(everything.start[:2]) < 15).all(axis=0)
+    share = everything.weight[all_near].sum() / everything.weight.sum()
+    assert few.weight[near].sum() / few.weight.sum() == pytest.approx(share, abs=0.03)
+
+
+def test_where_much_is_seen_fewer_candidates_are_looked_at(monkeypatch):
+    monkeypatch.setattr(views_module, "MOST", 40_000)
+    scene, forest = two_rooms()
+    some, free = patches(scene, forest, EFFORT), candidates(scene, forest, NOWHERE, EFFORT)
+    count = views_module.affordable(scene, free.position, some)
+    assert 4 < count < len(free.position)
+    thinned = free.thinned(count)
+    assert 1 <= len(thinned.position) <= count
+    assert len(views(scene, thinned.position, some).patch) < 1.3 * 40_000
+    assert min(number_in(box, placed(two_rooms(), 4).position).sum() for box in (ROOM_A, ROOM_B)) >= 1
 
 
 def test_a_view_straight_from_four_times_as_far_is_worth_a_half_and_walls_hide():
