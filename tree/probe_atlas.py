@@ -179,7 +179,7 @@ def fetch(atlas: np.ndarray, layout: Layout, level: int, probe: np.ndarray, dire
     Returns
     -------
     (n, channels) ndarray
-        Continuous in the direction; of a constant map exactly its value.
+        Continuous in the direction; of a constant map exactly its value. Of half-precision texels float32.
 
     Raises
     ------
@@ -194,10 +194,11 @@ def fetch(atlas: np.ndarray, layout: Layout, level: int, probe: np.ndarray, dire
     size, pitch = layout.sizes[level], layout.pitch >> level
     place = octahedral.encode(direction) * size + np.float32(BORDER - 0.5)
     base = np.clip(np.floor(place).astype(np.int64), 0, pitch - 2)
-    u, v = np.moveaxis(place - base, -1, 0)[..., None].astype(atlas.dtype)
+    kind = np.result_type(atlas.dtype, np.float32)
+    u, v = np.moveaxis(place - base, -1, 0)[..., None].astype(kind)
     column, row = column + base[:, 0], row + base[:, 1]
-    below = _mix(atlas[row, column], atlas[row, column + 1], u)
-    return _mix(below, _mix(atlas[row + 1, column], atlas[row + 1, column + 1], u), v)
+    a, b, c, d = (atlas[row + y, column + x].astype(kind) for y in (0, 1) for x in (0, 1))
+    return _mix(_mix(a, b, u), _mix(c, d, u), v)
 
 
 def _mix(a: np.ndarray, b: np.ndarray, t: np.ndarray) -> np.ndarray:

@@ -203,6 +203,14 @@ def test_a_linear_function_of_u_and_v_is_found_exactly_within_a_face(level):
     assert found == pytest.approx(expected, abs=2e-6)
 
 
+def test_half_precision_texels_are_mixed_in_single_precision():
+    image, direction = noise(LAYOUT.sizes[0]).astype(np.float16), directions(12, 1000)
+    atlas = atlas_of(LAYOUT, 0, image, elsewhere=9)
+    found = fetch(atlas.astype(np.float16), LAYOUT, 0, np.full(1000, 4), direction)
+    assert found.dtype == np.float32
+    assert np.array_equal(found, fetch(atlas, LAYOUT, 0, np.full(1000, 4), direction))
+
+
 def test_levels_of_an_atlas_are_mip_levels_and_of_all_probes_have_room():
     layout = Layout.of(1000, 128)
     assert layout.sizes == (126, 62, 30, 14, 6)
