@@ -15,7 +15,7 @@ ROUNDING = 4 * 2.0**-24 * np.sqrt(SUMMED)
 """Of sums of so many float32 products, which round at random, and of a stored matrix."""
 
 BALANCED = 0.016
-"""Most that balancing changes a lobe, where 6 x 6 centres stand for a sphere; 0.004 on finer levels."""
+"""Most that balancing changes a lobe, where 6 x 6 centres stand for a sphere; half of it on finer levels."""
 
 
 @pytest.fixture(scope="module")
