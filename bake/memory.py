@@ -29,6 +29,9 @@ FOLDER = "memory"
 
 KIND, VERSION = "memory", 2
 
+MOST_PATHS = 1 << 21
+"""Paths of a data point, beyond which a file is not believed: the most that can be asked for, doubled."""
+
 
 @dataclass(frozen=True, eq=False)
 class Look:
@@ -247,6 +250,9 @@ def _check(memory: Memory) -> None:
         raise ValueError("arrays do not fit together")
     if any(not np.isfinite(array).all() for array, _ in shapes if array.dtype.kind == "f"):
         raise ValueError("a number is not finite")
+    paths = memory.measured.paths
+    if len(paths) and not (paths.min() > 0 and paths.max() <= MOST_PATHS):
+        raise ValueError("a data point has no paths, or too many")
     for row, end in ((memory.moved.row, size), (memory.planes, len(memory.plane))):
         if len(row) and not (row.min() >= -1 and row.max() < end):
             raise ValueError("a row does not exist")
