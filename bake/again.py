@@ -57,14 +57,15 @@ class Again(Refinement):
         new = Atlas([self.state.tree]).find(self.kept.level.astype(np.int64), self.kept.coords) < 0
         return join(take(self.kept, new), self.state.measured)
 
-    def _found(self, level: int, coords: np.ndarray) -> Seen:
+    def _found(self, level: int, coords: np.ndarray) -> tuple[Seen, int]:
         """Those that are known; others in voxels that are new or have other surfaces."""
         known = self._is_looked(level, coords) & ~self.past.surfaces.touch(level, coords)
         seen = self._seen_in(level, coords[~known])
         if not known.any():
-            return seen
+            return seen, 0
         old, has = self.memory.looks[level].seen, receivers.among(coords[known])
-        return old.take(has(self.grid.voxels_at(level, old.at.position))).plus(seen)
+        kept = old.take(has(self.grid.voxels_at(level, old.at.position)))
+        return kept.plus(seen), len(kept.at.key)
 
     def _is_looked(self, level: int, coords: np.ndarray) -> np.ndarray:
         """(n,) which voxels had receivers of their level."""

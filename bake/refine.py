@@ -47,6 +47,9 @@ CLEAR = 0.2
 SURE = 2.0
 """Standard deviations of noise that an error must exceed to count."""
 
+CLOSER, CLOSER_SEED = 4, 0xC105
+"""Paths that receivers get besides their own where an error may be too large but is not clear of noise; their seed."""
+
 FRONT = 0.05
 """Height above the surface at which a voxel's centre is in front of it [voxels]."""
 
@@ -181,6 +184,8 @@ class Refinement:
     ----------
     looks : list of Look
         Receivers of each level, those that finer ones have replaced too.
+    fresh : list of (n,) bool ndarray
+        Which receivers of each look were not known before.
     current : (n,) int64 ndarray
         Rows of all looks that the state has.
     unmoved : Measured
@@ -204,6 +209,7 @@ class Refinement:
             self.need[level] = np.where(outline.need[level] > 0, first, 0.0)
         self.asked = [np.zeros((0, 3), np.int64)] * self.grid.levels
         self.looks: list[Look] = []
+        self.fresh: list[np.ndarray] = []
         self.current = np.zeros(0, np.int64)
         self.state: State | None = None
         self.judged: tuple | None = None
@@ -289,12 +295,36 @@ class Refinement:
         of_level, coords = self.state.tree.voxels()
         self._look_in(level, coords[of_level == level])
         self._hide(self.state.seen.at)
+        if self.target.error and level < self.grid.levels - 1:
+            self._look_closer(level)
+
+    def _look_closer(self, level: int) -> None:
+        """More paths for new receivers in voxels of a level that may be too wrong, but not beyond doubt."""
+        first = sum(len(look.seen.at.key) for look in self.looks[:level])
+        own = self.current - first
+        own = np.where((own >= 0) & (own < len(self.fresh[level])), own, -1)
+        voxel, squared, allowed, sure = self._judged(level)
+        doubtful = (squared > allowed) & (squared <= sure)
+        rows = np.flatnonzero((voxel >= 0) & doubtful[voxel] & (own >= 0) & self.fresh[level][own])
+        if not len(rows):
+            return
+        samples, seed = CLOSER * self.target.samples, self.target.effort.seed ^ CLOSER_SEED
+        effort = dataclasses.replace(self.target.effort, samples=samples, seed=seed)
+        found = trace(self.scene, self.state.seen.at.take(rows), effort).light
+        light, looked = self.state.seen.light.copy(), self.looks[level]
+        light[:, rows] = (light[:, rows] + CLOSER * found) / (1 + CLOSER)
+        kept = looked.seen.light.copy()
+        kept[:, own[rows]] = light[:, rows]
+        self.looks[level] = Look(looked.coords, Seen(looked.seen.at, kept))
+        self.state = dataclasses.replace(self.state, seen=Seen(self.state.seen.at, light))
 
     def _look_in(self, level: int, coords: np.ndarray) -> None:
         """Receivers in voxels of a level that have none of that level yet."""
         while len(self.looks) <= level:
             self.looks.append(Look(coords[:0], Seen.none(functions(self.scene))))
-        found, old = self._found(level, coords), self.looks[level]
+            self.fresh.append(np.zeros(0, bool))
+        (found, known), old = self._found(level, coords), self.looks[level]
+        self.fresh[level] = np.append(self.fresh[level], np.arange(len(found.at.key)) >= known)
         end = sum(len(look.seen.at.key) for look in self.looks[: level + 1])
         self.looks[level] = Look(np.concatenate([old.coords, coords]), old.seen.plus(found))
         new, current = np.arange(len(found.at.key)), self.current
@@ -305,9 +335,9 @@ class Refinement:
             seen, current = seen.take(kept).plus(found), current[kept]
         self.state, self.current = dataclasses.replace(self.state, seen=seen), np.concatenate([current, end + new])
 
-    def _found(self, level: int, coords: np.ndarray) -> Seen:
-        """Receivers on all surfaces in voxels of a level, with their light."""
-        return self._seen_in(level, coords)
+    def _found(self, level: int, coords: np.ndarray) -> tuple[Seen, int]:
+        """Receivers on all surfaces in voxels of a level, with their light, and how many of them were known before."""
+        return self._seen_in(level, coords), 0
 
     def _seen_in(self, level: int, coords: np.ndarray) -> Seen:
         """Receivers in some of the tree's voxels of a level, traced."""
@@ -404,17 +434,24 @@ class Refinement:
             self.judged = self.state, found
         return self.judged[1]
 
+    def _judged(self, level: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """(receivers,) row among the solid voxels of a level that each lies in, -1 for none; and of these voxels the
+        squared error over the area, what of it is allowed, and what is too much beyond doubt, infinite for those of too
+        few receivers."""
+        coords, at = self.outline.coords[level], self.state.seen.at
+        voxel = finder(coords)(self.grid.voxels_at(level, at.position))
+        inside, count = np.flatnonzero(voxel >= 0), len(coords)
+        row, area = voxel[inside], at.area[inside]
+        squared, noise = (np.bincount(row, values[inside] * area, count) for values in self._errors())
+        number = np.bincount(row, minlength=count)
+        allowed = self.target.error**2 * np.bincount(row, area, count)
+        sure = allowed + SURE * noise * np.sqrt(2 / np.maximum(number, 1))
+        return voxel, squared, allowed, np.where(number >= FEWEST, sure, np.inf)
+
     def _wanting(self, level: int) -> np.ndarray:
         """What subdivision of each solid voxel of a level buys for each data point; 0 where it is good enough."""
-        coords, at = self.outline.coords[level], self.state.seen.at
-        row = finder(coords)(self.grid.voxels_at(level, at.position))
-        inside, row = np.flatnonzero(row >= 0), row[row >= 0]
-        area, count = at.area[inside], len(coords)
-        squared, noise = (np.bincount(row, values[inside] * area, count) for values in self._errors())
-        number = np.maximum(np.bincount(row, minlength=count), 1)
-        allowed = self.target.error**2 * np.bincount(row, area, count) + SURE * noise * np.sqrt(2 / number)
-        poor = (squared > allowed) & (number >= FEWEST)
-        return np.where(poor, squared / np.maximum(self.outline.cost(level), 1), 0.0)
+        _, squared, _, sure = self._judged(level)
+        return np.where(squared > sure, squared / np.maximum(self.outline.cost(level), 1), 0.0)
 
     def _unlit(self, level: int) -> np.ndarray:
         """(m, 3) missing voxels in front of receivers that hardly any data point lights, and that are wrong for it:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from command_line import yard
 from gi_volumes.bake import job
@@ -75,3 +76,40 @@ def test_saying_no_at_any_time_stops_the_work_at_once():
         with pytest.raises(CancelledError):
             refine(*parts(), lambda share, said=said, calls=calls: said.append(share) or len(said) <= calls)
         assert said == shares[: calls + 1]
+
+
+def looked_at(made: Refinement) -> tuple[np.ndarray, np.ndarray]:
+    """Levels and keys of all receivers, in one number, and their light."""
+    seen = [look.seen for look in made.looks]
+    keys = [part.at.key + (np.int64(level) << 32) for level, part in enumerate(seen)]
+    return np.concatenate(keys), np.concatenate([part.light for part in seen], axis=1)
+
+
+def test_receivers_in_doubt_get_more_paths_and_others_keep_theirs(monkeypatch):
+    plain, made = Refinement(*parts(), None), Refinement(*parts(), None)
+    made.run()
+    monkeypatch.setattr(Refinement, "_look_closer", lambda self, level: None)
+    plain.run()
+    (key, light), (plain_key, plain_light) = looked_at(made), looked_at(plain)
+    _, row, plain_row = np.intersect1d(key, plain_key, return_indices=True)
+    light, plain_light = light[:, row], plain_light[:, plain_row]
+    other = (np.abs(light - plain_light) > 1e-3 * plain_light.mean()).any(axis=(0, 2, 3))
+    assert 10 < other.sum() < 0.9 * len(other)
+    spread = [np.square(part[0] - part[1])[other].mean() for part in (plain_light, light)]
+    assert spread[1] < spread[0] / 2
+    assert np.array_equal(made.state.seen.light, looked_at(made)[1][:, made.current])
+
+
+def test_coarse_voxels_that_have_become_poor_are_judged_once_more(monkeypatch):
+    judged = []
+    monkeypatch.setattr(
+        Refinement, "_wanting", lambda self, level, own=Refinement._wanting: judged.append(level) or own(self, level)
+    )
+    made = Refinement(*parts(), None)
+    made.run()
+    levels = made.grid.levels
+    assert judged == [*range(levels - 1), *range(levels - 1)]
+    at, count = made.state.seen.at, len(made.state.seen.at.key)
+    assert len(np.unique(made.current)) == count == len(made.current)
+    keys = np.concatenate([look.seen.at.key for look in made.looks])
+    assert np.array_equal(keys[made.current], at.key)
