@@ -17,10 +17,11 @@ from ..tree.region import finder
 from . import changes, receivers
 from .blocks import by_level
 from .changes import Past
+from .hidden import Hidden, rows_in
 from .measured import Measured, join, move, take
 from .memory import Memory
 from .receivers import Receivers
-from .refine import Hidden, Refinement, Target, rows_in
+from .refine import Refinement, Target
 from .scene import Scene
 from .survey import Judge, Seen, State
 

@@ -16,20 +16,18 @@ import numpy as np
 
 from ..tree import build, interpolate
 from ..tree.blend import ENOUGH
-from ..tree.cells import OFFSET_STEPS
 from ..tree.dualcells import CORNERS
 from ..tree.grid import Grid
 from ..tree.lookup import Atlas
 from ..tree.outline import Outline
 from ..tree.region import finder
 from ..tree.topology import Topology
-from . import judges, occluders, parallel, receivers
-from .blocks import BLOCK, Blocks, by_level, voxels_of
-from .datapoints import FARTHEST_STEP
+from . import cracks, hidden, occluders, parallel, receivers
 from .deadline import Pace
 from .gather import Effort
+from .hidden import Hidden
 from .lamps import LUMINANCE
-from .measured import Measured, Sampling, functions, measure, move, moved_light, take
+from .measured import Measured, Sampling, functions, measure, move, moved_light
 from .memory import Look, Moved
 from .receivers import Receivers
 from .scene import Scene
@@ -52,9 +50,6 @@ CLOSER, CLOSER_SEED = 4, 0xC105
 
 FRONT = 0.05
 """Height above the surface at which a voxel's centre is in front of it [voxels]."""
-
-AWAY = 0.25
-"""A data point that moves to an unlit receiver goes at most this far in front of it [voxels]."""
 
 NOISE = 0.35
 """Noise of a data point to aim at, as a part of the target error. It is estimated as if paths were spread by chance; as
@@ -148,20 +143,6 @@ def sketch(scene: Scene, outline: Outline, judge: Judge, target: Target) -> Stat
     made._grow()
     made._look(len(outline.coords) - 1)
     return made.state
-
-
-@dataclass(frozen=True, eq=False)
-class Hidden:
-    """Planes of a tree as it was.
-
-    tree : Topology, measured : Measured, its data points
-    planes, plane : as in `Occluders`
-    """
-
-    tree: Topology
-    measured: Measured
-    planes: np.ndarray
-    plane: np.ndarray
 
 
 class Refinement:
@@ -363,9 +344,9 @@ class Refinement:
     def _hide_midway(self) -> None:
         """Planes for all data points, as dense receivers on all surfaces see them that the cell may light, those of
         other cells too."""
-        self._fit_planes(judges.around(self.scene, self.grid, self.state.tree, self.target.effort.threads))
-        data = self.state.data
-        self.hidden = Hidden(self.state.tree, self.state.measured, data.planes, data.plane)
+        parallel.check()
+        self.hidden = hidden.everywhere(self.scene, self.state, self.target.effort.threads)
+        self._set_planes(self.hidden.planes, self.hidden.plane)
 
     def _hide_finally(self) -> None:
         """The same for what has changed since."""
@@ -377,45 +358,13 @@ class Refinement:
     def _hide_since(self, old: Hidden, new: np.ndarray) -> None:
         """Planes of before, but for some data points, and those around whatever is new, gone, or elsewhere."""
         parallel.check()
-        tree, measured, threads = self.state.tree, self.state.measured, self.target.effort.threads
-        new = new | by_level(self._changed_since(old).beside, measured)
-        row, plane = rows_in(tree, old.tree), old.plane
-        planes = np.where(row[:, None] >= 0, old.planes[np.maximum(row, 0)], -1)
-        if new.any():
-            self._set_planes(np.where(new[:, None], -1, planes), plane)
-            hidden = occluders.fit(self.scene, self.state.data, self._judges_of(new), threads, only=new)
-            planes[new] = np.where(hidden.planes[new] >= 0, hidden.planes[new] + len(plane), -1)
-            plane = np.concatenate([plane, hidden.plane])
-        self._set_planes(*_distinct(planes, plane))
-
-    def _changed_since(self, old: Hidden) -> Blocks:
-        """Voxels that are new, are gone, or have another data point."""
-        here, there = self.state.measured, old.measured
-        row = rows_in(self.state.tree, old.tree)
-        new = row < 0
-        off = ~new & ((here.offset != there.offset[row]).any(axis=1) | (here.valid != there.valid[row]))
-        gone = rows_in(old.tree, self.state.tree) < 0
-        return Blocks([*voxels_of(take(here, new | off)).marks, *voxels_of(take(there, gone)).marks])
-
-    def _judges_of(self, new: np.ndarray) -> Receivers:
-        """Receivers that some data points may light: dense around fine ones and leaves, around other coarse ones those
-        whose light is traced."""
-        tree, measured, at = self.state.tree, self.state.measured, self.state.seen.at
-        if new.all():
-            return judges.around(self.scene, self.grid, tree, self.target.effort.threads)
-        coarse = (measured.level < BLOCK) & ~tree.leaves
-        close = by_level(voxels_of(take(measured, new & ~coarse)).beside, measured)
-        dense = judges.around(self.scene, self.grid, tree, self.target.effort.threads, close)
-        others, seen = voxels_of(take(measured, new & coarse)), np.zeros(len(at.key), bool)
-        for level in range(BLOCK):
-            seen |= others.beside(level, self.grid.voxels_at(level, at.position))
-        return receivers.join([dense, at.take(seen)])
+        self._set_planes(*hidden.since(self.scene, self.state, old, new, self.target.effort.threads))
 
     def _fit_planes(self, at: Receivers) -> None:
         """Planes as some receivers see the data points."""
         parallel.check()
-        hidden = occluders.fit(self.scene, self.state.data, at, self.target.effort.threads)
-        self._set_planes(hidden.planes, hidden.plane)
+        found = occluders.fit(self.scene, self.state.data, at, self.target.effort.threads)
+        self._set_planes(found.planes, found.plane)
 
     def _set_planes(self, planes: np.ndarray, plane: np.ndarray) -> None:
         """Give the data points their planes."""
@@ -471,18 +420,9 @@ class Refinement:
         return squared > max(self.target.error, CLEAR) ** 2 + SURE**2 * noise
 
     def _fill_cracks(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rows of data points that move to where receivers have none, in voxels that are of less use elsewhere, and
-        their offsets."""
-        at, measured = self.state.seen.at, self.state.measured
+        """Rows of data points that move to where receivers have none, and their offsets."""
         unlit = np.flatnonzero((confidence(self.state) < ENOUGH) & self._wrong())
-        row = _leaves(self.grid, self.state.tree, at.position[unlit])
-        offset, free = self._in_front(unlit, row)
-        unlit, row, offset = unlit[free], row[free], offset[free]
-        use, gain = self._usefulness(), np.bincount(row, at.area[unlit], len(measured.level))
-        order = np.lexsort((-at.area[unlit], row))
-        row, first = np.unique(row[order], return_index=True)
-        offset, better = offset[order][first], gain[row] > use[row]
-        return row[better], offset[better]
+        return cracks.find(self.scene, self.state, unlit)
 
     def _take_moved(self, chosen: tuple[np.ndarray, np.ndarray]) -> None:
         """Measure some data points elsewhere."""
@@ -498,29 +438,6 @@ class Refinement:
         """(m, functions, 9, 3) what data points measure elsewhere in their voxels."""
         return moved_light(self.scene, self.grid, self.unmoved, row, offset, self.target.effort)
 
-    def _in_front(self, chosen: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(n, 3) int8 offsets half-way to what stands before receivers, within their voxels, and (n,) whether the way
-        there is free."""
-        at = self.state.seen.at.take(chosen)
-        size, origin = self.state.data.size[row], receivers.lifted(self.scene, at)
-        far = (2 * AWAY * size).astype(np.float32)
-        hits = self.scene.tracer.intersect_opaque(origin, np.ascontiguousarray(at.normal.T), far)
-        reach = np.where(hits.triangle >= 0, np.minimum(hits.distance, far), far) / 2
-        center = (self.state.measured.coords[row] + 0.5) * size[:, None]
-        steps = (at.position + at.normal * reach[:, None] - center) / size[:, None] * OFFSET_STEPS
-        offset = np.clip(np.round(steps), -FARTHEST_STEP, FARTHEST_STEP)
-        place = (center + offset * size[:, None] / OFFSET_STEPS).T.astype(np.float32)
-        blocked = self.scene.tracer.blocked(origin, np.ascontiguousarray(place - origin), np.ones(len(row), np.float32))
-        height = ((place.T - at.position) * at.normal).sum(axis=1)
-        return offset.astype(np.int8), ~blocked & (height > 0)
-
-    def _usefulness(self) -> np.ndarray:
-        """(points,) area of the receivers that each data point lights, by its share [m2]."""
-        at = self.state.seen.at
-        row, weight = interpolate.weigh(self.state.data, at.position, at.normal)
-        share = weight / np.maximum(weight.sum(axis=1, keepdims=True), ENOUGH) * at.area[:, None]
-        return np.bincount(row.ravel(), share.ravel(), len(self.state.measured.level))
-
     def _show(self) -> Callable[[float], bool] | None:
         """What the next stage is to call with the part of it that is done; each level has up to three, the revision one
         for each level and two."""
@@ -535,38 +452,3 @@ def _voxels_of(grid: Grid, tree: Topology, level: int) -> Callable[[np.ndarray],
     """A function that says which positions lie in a tree's voxels of a level."""
     atlas = Atlas([tree])
     return lambda position: atlas.find(level, grid.voxels_at(level, position)) >= 0
-
-
-def _leaves(grid: Grid, tree: Topology, position: np.ndarray) -> np.ndarray:
-    """(n,) finest voxel that holds each position."""
-    atlas, row = Atlas([tree]), np.zeros(len(position), np.int64)
-    for level in range(grid.levels):
-        found = atlas.find(level, grid.voxels_at(level, position))
-        row = np.where(found >= 0, found, row)
-    return row
-
-
-def rows_in(tree: Topology, other: Topology) -> np.ndarray:
-    """Find the voxels of a tree in another one.
-
-    Parameters
-    ----------
-    tree, other : Topology
-        Of the same cell.
-
-    Returns
-    -------
-    (size,) int64 ndarray
-        Row of each in the other tree; -1 where it has none.
-    """
-    level, coords = tree.voxels()
-    return Atlas([other]).find(level.astype(np.int64), coords)
-
-
-def _distinct(planes: np.ndarray, plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Planes that are used, each once, as `Occluders` has them."""
-    used = planes >= 0
-    table, row = np.unique(plane[planes[used]].reshape(-1, 5), axis=0, return_inverse=True)
-    out = np.full(planes.shape, -1, np.int32)
-    out[used] = row.reshape(-1)
-    return out, table

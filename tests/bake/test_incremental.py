@@ -12,7 +12,8 @@ from gi_volumes.bake import cell_job, changes, job, memory
 from gi_volumes.bake.again import Again, remember, settled
 from gi_volumes.bake.blocks import Blocks
 from gi_volumes.bake.gather import Effort
-from gi_volumes.bake.refine import Refinement, Target, rows_in
+from gi_volumes.bake.hidden import rows_in
+from gi_volumes.bake.refine import Refinement, Target
 from gi_volumes.bake.scene import prepare
 from gi_volumes.bake.settings import Settings, choose_grid, model
 from gi_volumes.bake.snapshot import Channel, LightKind, Material
