@@ -58,15 +58,15 @@ class Again(Refinement):
         new = Atlas([self.state.tree]).find(self.kept.level.astype(np.int64), self.kept.coords) < 0
         return join(take(self.kept, new), self.state.measured)
 
-    def _found(self, level: int, coords: np.ndarray) -> tuple[Seen, int]:
+    def _found(self, level: int, coords: np.ndarray) -> tuple[Seen, np.ndarray]:
         """Those that are known; others in voxels that are new or have other surfaces."""
         known = self._is_looked(level, coords) & ~self.past.surfaces.touch(level, coords)
         seen = self._seen_in(level, coords[~known])
         if not known.any():
-            return seen, 0
-        old, has = self.memory.looks[level].seen, receivers.among(coords[known])
-        kept = old.take(has(self.grid.voxels_at(level, old.at.position)))
-        return kept.plus(seen), len(kept.at.key)
+            return seen, np.zeros(0, bool)
+        look, has = self.memory.looks[level], receivers.among(coords[known])
+        rows = np.flatnonzero(has(self.grid.voxels_at(level, look.seen.at.position)))
+        return look.seen.take(rows).plus(seen), look.closer[rows]
 
     def _is_looked(self, level: int, coords: np.ndarray) -> np.ndarray:
         """(n,) which voxels had receivers of their level."""
@@ -142,13 +142,17 @@ class Again(Refinement):
         """Planes of before where nothing is decided; others anew."""
         measured = self.state.measured
         new = by_level(self.past.decide.touch, measured) | self._beside_surfaces()
-        self._hide_since(Hidden(self.memory.tree, self.memory.measured, self.memory.planes, self.memory.plane), new)
+        self._hide_since(self._hidden_before(), new)
 
     def _hide_finally(self) -> None:
         """Planes of before where neither tree nor surfaces have changed, nor data points been moved; others anew."""
+        self._hide_since(self._hidden_before(), self._beside_surfaces())
+
+    def _hidden_before(self) -> Hidden:
+        """Planes of before, with the data points where they were in the end."""
         memory = self.memory
         there = move(memory.measured, memory.moved.row, memory.moved.offset, memory.moved.light)
-        self._hide_since(Hidden(memory.tree, there, memory.planes, memory.plane), self._beside_surfaces())
+        return Hidden(memory.tree, there, memory.planes, memory.plane)
 
     def _beside_surfaces(self) -> np.ndarray:
         """(points,) which data points have, or light, surfaces that have changed."""

@@ -327,19 +327,21 @@ def _fill_cell(work: Work, cell: tuple[int, int], found: Outline, show: Callable
     scene = work.trusted(work.light_in(voxels, show), voxels)
     if found.cell in work.checks:
         whole, show = show, lambda share: whole(CACHED + (1 - CACHED) * share)
+    cut = False
     for attempt in range(BUDGET_TRIES):
         last = attempt == BUDGET_TRIES - 1
         made = Refinement(scene, found, work.judge, target, _part_of(show, attempt) if limit else show)
         made.pace = work.deadline.pace()
         refined = made.run()
-        size = _write(work, cell, refined, limit=0 if last else limit, early=made.cut)
+        cut |= made.cut
+        size = _write(work, cell, refined, limit=0 if last else limit, early=cut)
         if last or not limit or size <= limit:
             break
         points = int(made.state.tree.size * BUDGET_MARGIN * limit / size)
         target = dataclasses.replace(target, max_points=max(points, int(np.prod(found.dense.shape)) + 1))
     if limit and size > limit:
         work.warnings.append(f"cell {list_of([cell])} takes {size:,} bytes, {size - limit:,} more than --max-bytes")
-    if made.cut:
+    if cut:
         work.cut.add(cell)
     elif work.history:
         _keep(work, remember(made, work.history.causes, work.history.rules, None))

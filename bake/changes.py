@@ -29,7 +29,7 @@ from .sensors import HarmonicsSensor
 from .snapshot import LightKind, Snapshot
 from .sobol import scramble
 from .surfels import Surfels
-from .survey import Judge, Seen, trace
+from .survey import Judge, Seen, trace, trace_closer
 
 __all__ = ["Past", "causes", "compare", "pilot", "triangles_near"]
 
@@ -262,10 +262,12 @@ class _Update:
         """Receivers of a level, some of them with light of today."""
         if not len(self.columns):
             return look
-        fresh = trace(self.scene, look.seen.at.take(rows), dataclasses.replace(self.effort, samples=self.samples))
-        light = look.seen.light.copy()
-        light[:, rows[:, None], self.columns] = fresh.light
-        return Look(look.coords, Seen(look.seen.at, light))
+        effort = dataclasses.replace(self.effort, samples=self.samples)
+        fresh = trace(self.scene, look.seen.at.take(rows), effort)
+        found, light, closer = fresh.light.copy(), look.seen.light.copy(), np.flatnonzero(look.closer[rows])
+        found[:, closer] = trace_closer(self.scene, fresh.take(closer), effort)
+        light[:, rows[:, None], self.columns] = found
+        return Look(look.coords, Seen(look.seen.at, light), look.closer)
 
     def _light(self, measured: Measured, rows: np.ndarray, offset: np.ndarray, paths: int) -> np.ndarray:
         """(m, columns, 9, 3) light in some voxels."""
@@ -275,25 +277,34 @@ class _Update:
 
 class _Around:
     """Says for which receivers light has changed: those with a data point of their level around them that has changed
-    by itself or with its pool, and those without any that is known."""
+    by itself or with its pool; of the next coarser level, where theirs are not complete; and those without any that is
+    known."""
 
     def __init__(self, grid: Grid, known: Measured, wide: Measured, alone: Measured) -> None:
         self.grid = grid
-        self.known, self.wide = dict(pools(grid, known)), dict(pools(grid, wide))
-        self.alone = {int(level): alone.coords[alone.level == level] for level in np.unique(alone.level)}
+        self.wide = dict(pools(grid, wide))
+        self.known, self.alone = (
+            {int(level): part.coords[part.level == level] for level in np.unique(part.level)} for part in (known, alone)
+        )
 
     def rows(self, level: int, at: Receivers) -> np.ndarray:
         """(m,) which receivers of a level."""
+        number, changed = self._of_level(level, at)
+        coarse, coarsely = self._of_level(level - 1, at) if level else (number, changed)
+        return np.flatnonzero(changed | (coarsely & (number < len(CORNERS))) | (number + coarse == 0))
+
+    def _of_level(self, level: int, at: Receivers) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) how many data points of a level are known around receivers, and whether any of them has changed."""
         none, size = np.zeros((0, 3), np.int64), float(self.grid.voxel_size(level))
         is_known, is_wide, is_alone = (
             receivers.among(part.get(level, none)) for part in (self.known, self.wide, self.alone)
         )
         ratio = round(float(self.grid.voxel_size(int(pool_level(self.grid, level)))) / size)
-        known, changed = np.zeros((2, len(at.key)), bool)
+        number, changed = np.zeros(len(at.key), np.int64), np.zeros(len(at.key), bool)
         for corner in CORNERS - 0.5:
             voxel = np.floor(at.position / size + corner).astype(np.int64)
-            known, changed = known | is_known(voxel // ratio), changed | is_wide(voxel // ratio) | is_alone(voxel)
-        return np.flatnonzero(changed | ~known)
+            number, changed = number + is_known(voxel), changed | is_wide(voxel // ratio) | is_alone(voxel)
+        return number, changed
 
 
 def _only(scene: Scene, names: list[str]) -> Scene:

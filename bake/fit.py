@@ -186,9 +186,12 @@ def trust(system: System, traced: np.ndarray, halves: np.ndarray) -> np.ndarray:
     first, second = ((known - half).astype(np.float64) / (largest or 1.0) for half in halves)
     noise = _around(system, ((first - second) ** 2).sum(axis=(1, 2)) / 4)
     error = np.maximum(_around(system, (first * second).sum(axis=(1, 2))), 0.0)
-    doubt = DOUBT * _around(system, np.abs(first * second).sum(axis=(1, 2))) / np.maximum(_around(system), 1.0)
+    local = _local_weight(system)
+    doubt = (
+        DOUBT * local * _around(system, np.abs(first * second).sum(axis=(1, 2))) / np.maximum(_around(system), local)
+    )
     ratio = (noise + doubt) / np.maximum(error + doubt, NOTHING)
-    return np.minimum(LEAST_TRUST + NOISE_TRUST * ratio, MOST_TRUST) * _local_weight(system)
+    return np.minimum(LEAST_TRUST + NOISE_TRUST * ratio, MOST_TRUST) * local
 
 
 def evaluate(system: System, values: np.ndarray) -> np.ndarray:
@@ -226,10 +229,11 @@ def _around(system: System, values: np.ndarray | None = None) -> np.ndarray:
 
 
 def _local_weight(system: System) -> np.ndarray:
-    """(points,) mean weight of the receivers around each data point; 1 where there are none."""
+    """(points,) mean weight of the receivers around each data point; 1 where none counts."""
     row = np.where(system.weight != 0, system.row, 0)
     number = np.bincount(row.ravel(), system.weight.ravel(), system.points)
-    return np.where(number > 0, _around(system) / np.maximum(number, NOTHING), 1.0)
+    weight = _around(system)
+    return np.where(weight > 0, weight / np.maximum(number, NOTHING), 1.0)
 
 
 def _mean(weights: np.ndarray) -> float:

@@ -138,24 +138,24 @@ def _gather_tile(scene: Scene, sensor: Sensor, position, rows, keys, effort: Eff
     squared = np.zeros((len(rows), len(sensor.watched)))
     for first in range(0, effort.samples, BLOCK_SAMPLES):
         count = min(BLOCK_SAMPLES, effort.samples - first)
-        sums = _gather_block(scene, sensor, position, rows, Sampler(keys, first, count), count, effort.bounces)
-        total += sums.sum(axis=0)
-        squared += _squared_noise(sums, sensor.watched)
+        sampler = Sampler(keys, first, count)
+        sums, variance = _gather_block(scene, sensor, position, rows, sampler, count, effort.bounces)
+        total += sums
+        squared += variance
     mean = (total / effort.samples).astype(np.float32)
     noise = np.sqrt(squared) / effort.samples
     return mean.reshape(len(rows), sensor.responses, channels, 3).transpose(0, 2, 1, 3), noise
 
 
-def _squared_noise(sums: np.ndarray, watched: np.ndarray) -> np.ndarray:
-    """(points, watched) variances of sums over all parts; infinite where one part can't tell."""
-    if not len(watched):
-        return np.zeros((sums.shape[1], 0))
-    found = sums[:, :, 0] @ watched.reshape(len(watched), -1).T
-    return found.var(axis=0, ddof=1) * len(found) if len(found) > 1 else np.full(found.shape[1:], np.inf)
+def _variance(parts: np.ndarray, sizes: np.ndarray, watched: np.ndarray) -> np.ndarray:
+    """(points, watched) variances of the sum over all (parts, points, channels) of a block; 0 where one can't tell."""
+    found = parts @ watched.reshape(len(watched), -1).T if len(watched) else np.zeros((*parts.shape[:2], 0))
+    mean = found.sum(axis=0) / sizes.sum()
+    return ((found - mean * sizes[:, None, None]) ** 2).sum(axis=0) * len(parts) / max(len(parts) - 1, 1)
 
 
 def _gather_block(scene: Scene, sensor: Sensor, position, rows, sampler: Sampler, count: int, bounces: int):
-    """(parts, points, responses, channels * 3) sums over parts of one block of samples."""
+    """(points, responses, channels * 3) sums over one block of samples, and (points, watched) their variances."""
     point, sample = np.divmod(np.arange(len(rows) * count), count)
     numbers = Numbers(sampler, point, sample)
     lanes = np.arange(len(point))
@@ -167,22 +167,33 @@ def _gather_block(scene: Scene, sensor: Sensor, position, rows, sampler: Sampler
     stacked = light.stacked()
     stacked /= pdf
     weights = sensor.response(rows[point], direction)
-    size = max(1, min(SUMMED_SAMPLES, count // PARTS)) if len(sensor.watched) else SUMMED_SAMPLES
-    shape = len(rows), count, size
-    total = _project(weights, stacked.reshape(-1, len(lanes)), shape)
+    ends = _ends(count, bool(len(sensor.watched)))
+    total, parts = _project(weights, stacked.reshape(-1, len(lanes)), len(rows), ends)
     for channel, toward, value in _direct(scene, sensor, start, rows[point], numbers, lanes, bounces):
-        weights = sensor.response(rows[point], toward)
-        total[..., 3 * channel : 3 * channel + 3] += _project(weights, value, shape)
-    return total
+        own, weights = slice(3 * channel, 3 * channel + 3), sensor.response(rows[point], toward)
+        for whole, found in zip((total, parts), _project(weights, value, len(rows), ends), strict=True):
+            whole[..., own] += found
+    return total, _variance(parts, np.diff(ends), sensor.watched)
 
 
-def _project(weights: np.ndarray, values: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
-    """(parts, points, responses, channels) sums over samples, as matrix products of a few samples of each point."""
-    points, count, size = shape
-    left = np.ascontiguousarray(weights.reshape(-1, points, count).transpose(1, 0, 2))
-    right = np.ascontiguousarray(values.reshape(-1, points, count).transpose(1, 2, 0))
-    parts = [slice(first, first + size) for first in range(0, count, size)]
-    return np.stack([left[:, :, part] @ right[:, part] for part in parts]).astype(np.float64)
+def _ends(count: int, watched: bool) -> np.ndarray:
+    """Where the parts of a block of samples end, the first one's beginning first: parts of equal size but for one."""
+    parts = max(-(-count // SUMMED_SAMPLES), min(PARTS, count) if watched else 1)
+    return np.arange(parts + 1) * count // parts
+
+
+def _project(weights: np.ndarray, values: np.ndarray, points: int, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(points, responses, channels) sums over samples, as matrix products of a few samples of each point, and
+    (parts, points, channels) what each adds to the first response."""
+    left = np.ascontiguousarray(weights.reshape(-1, points, ends[-1]).transpose(1, 0, 2))
+    right = np.ascontiguousarray(values.reshape(-1, points, ends[-1]).transpose(1, 2, 0))
+    total = np.zeros((points, left.shape[1], right.shape[2]))
+    parts = np.empty((len(ends) - 1, points, right.shape[2]))
+    for number, part in enumerate(map(slice, ends[:-1], ends[1:])):
+        found = left[:, :, part] @ right[:, part]
+        parts[number] = found[:, 0]
+        total += found
+    return total, parts
 
 
 def _direct(scene: Scene, sensor: Sensor, position, rows, numbers: Numbers, lanes, bounces: int):

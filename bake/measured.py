@@ -1,7 +1,7 @@
 """Light measured at the data points of a tree that grows: what is known is kept, what is new is traced.
 
 Comes in: a tree, and what an earlier tree of the same cell had. Goes out: position, validity and coefficients of
-every voxel, in the order of the tree. A voxel's measure depends on the voxel alone, not on when it was asked for.
+every voxel, in the order of the tree. A voxel's paths depend on the voxel alone, their number on its parent's noise.
 """
 
 from __future__ import annotations

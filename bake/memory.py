@@ -39,10 +39,12 @@ class Look:
 
     coords : (k, 3) int64, voxels of the level whose surfaces they stand for
     seen : Seen
+    closer : (n,) bool, which of them have been looked at closer
     """
 
     coords: np.ndarray
     seen: Seen
+    closer: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +143,8 @@ def save(memory: Memory, target: str | os.PathLike) -> int:
     arrays |= {f"measured/{name}": getattr(memory.measured, name) for name in PARTS}
     arrays |= {f"moved/{name}": getattr(moved, name) for name in ("row", "offset", "light")}
     for level, look in enumerate(memory.looks):
-        arrays[f"look/{level}/coords"], arrays[f"look/{level}/light"] = look.coords, look.seen.light
+        arrays |= {f"look/{level}/coords": look.coords, f"look/{level}/light": look.seen.light}
+        arrays[f"look/{level}/closer"] = look.closer
         arrays |= {f"look/{level}/{name}": getattr(look.seen.at, name) for name in FIELDS}
     for level, (coords, value) in enumerate(memory.need):
         arrays |= {f"need/{level}/coords": coords, f"need/{level}/value": value}
@@ -211,7 +214,8 @@ def _memory(file: container.Container, grid: Grid) -> Memory:
     looks = []
     for level in range(meta["counts"][0]):
         at = Receivers(*(arrays[f"look/{level}/{name}"] for name in FIELDS))
-        looks.append(Look(arrays[f"look/{level}/coords"], Seen(at, arrays[f"look/{level}/light"])))
+        coords, light, closer = (arrays[f"look/{level}/{name}"] for name in ("coords", "light", "closer"))
+        looks.append(Look(coords, Seen(at, light), closer))
     need = [(arrays[f"need/{level}/coords"], arrays[f"need/{level}/value"]) for level in range(meta["counts"][1])]
     asked = [arrays[f"asked/{level}"] for level in range(meta["counts"][2])]
     own = (arrays[name] for name in ("planes", "plane", "corners", "opaque"))
@@ -239,6 +243,7 @@ def _check(memory: Memory) -> None:
         (memory.current, (sum(len(look.seen.at.key) for look in memory.looks),)),
         (memory.corners, (len(memory.opaque), 3, 3)),
         *((look.seen.light, (2, len(look.seen.at.key), functions, 3)) for look in memory.looks),
+        *((look.closer, look.seen.at.key.shape) for look in memory.looks),
         *(
             (getattr(look.seen.at, name), (len(look.seen.at.key), *getattr(none(), name).shape[1:]))
             for look in memory.looks

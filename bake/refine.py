@@ -31,7 +31,7 @@ from .measured import Measured, Sampling, functions, measure, move, moved_light
 from .memory import Look, Moved
 from .receivers import Receivers
 from .scene import Scene
-from .survey import Judge, Seen, State, confidence, squared_errors, trace
+from .survey import Judge, Seen, State, confidence, squared_errors, trace, trace_closer
 
 FEWEST = 2
 """Receivers without which a voxel is not judged."""
@@ -44,9 +44,6 @@ CLEAR = 0.2
 
 SURE = 2.0
 """Standard deviations of noise that an error must exceed to count."""
-
-CLOSER, CLOSER_SEED = 4, 0xC105
-"""Paths that receivers get besides their own where an error may be too large but is not clear of noise; their seed."""
 
 FRONT = 0.05
 """Height above the surface at which a voxel's centre is in front of it [voxels]."""
@@ -285,29 +282,30 @@ class Refinement:
         own = self.current - first
         own = np.where((own >= 0) & (own < len(self.fresh[level])), own, -1)
         voxel, squared, allowed, sure = self._judged(level)
-        doubtful = (squared > allowed) & (squared <= sure)
-        rows = np.flatnonzero((voxel >= 0) & doubtful[voxel] & (own >= 0) & self.fresh[level][own])
+        doubtful = (squared > allowed) & (squared <= sure) & np.isfinite(sure)
+        rows = np.flatnonzero((voxel >= 0) & (own >= 0))
+        rows = rows[doubtful[voxel[rows]] & self.fresh[level][own[rows]]]
         if not len(rows):
             return
-        samples, seed = CLOSER * self.target.samples, self.target.effort.seed ^ CLOSER_SEED
-        effort = dataclasses.replace(self.target.effort, samples=samples, seed=seed)
-        found = trace(self.scene, self.state.seen.at.take(rows), effort).light
-        light, looked = self.state.seen.light.copy(), self.looks[level]
-        light[:, rows] = (light[:, rows] + CLOSER * found) / (1 + CLOSER)
-        kept = looked.seen.light.copy()
-        kept[:, own[rows]] = light[:, rows]
-        self.looks[level] = Look(looked.coords, Seen(looked.seen.at, kept))
-        self.state = dataclasses.replace(self.state, seen=Seen(self.state.seen.at, light))
+        seen, looked = self.state.seen, self.looks[level]
+        light, kept, closer = seen.light.copy(), looked.seen.light.copy(), looked.closer.copy()
+        effort = dataclasses.replace(self.target.effort, samples=self.target.samples)
+        light[:, rows] = trace_closer(self.scene, seen.take(rows), effort)
+        kept[:, own[rows]], closer[own[rows]] = light[:, rows], True
+        self.looks[level] = Look(looked.coords, Seen(looked.seen.at, kept), closer)
+        self.state = dataclasses.replace(self.state, seen=Seen(seen.at, light))
 
     def _look_in(self, level: int, coords: np.ndarray) -> None:
         """Receivers in voxels of a level that have none of that level yet."""
         while len(self.looks) <= level:
-            self.looks.append(Look(coords[:0], Seen.none(functions(self.scene))))
+            self.looks.append(Look(coords[:0], Seen.none(functions(self.scene)), np.zeros(0, bool)))
             self.fresh.append(np.zeros(0, bool))
         (found, known), old = self._found(level, coords), self.looks[level]
-        self.fresh[level] = np.append(self.fresh[level], np.arange(len(found.at.key)) >= known)
+        fresh = np.arange(len(found.at.key)) >= len(known)
+        self.fresh[level] = np.append(self.fresh[level], fresh)
         end = sum(len(look.seen.at.key) for look in self.looks[: level + 1])
-        self.looks[level] = Look(np.concatenate([old.coords, coords]), old.seen.plus(found))
+        closer = np.concatenate([old.closer, known, np.zeros(fresh.sum(), bool)])
+        self.looks[level] = Look(np.concatenate([old.coords, coords]), old.seen.plus(found), closer)
         new, current = np.arange(len(found.at.key)), self.current
         current = np.where(current >= end, current + len(new), current)
         seen = found if self.state.seen is None else self.state.seen
@@ -316,9 +314,10 @@ class Refinement:
             seen, current = seen.take(kept).plus(found), current[kept]
         self.state, self.current = dataclasses.replace(self.state, seen=seen), np.concatenate([current, end + new])
 
-    def _found(self, level: int, coords: np.ndarray) -> tuple[Seen, int]:
-        """Receivers on all surfaces in voxels of a level, with their light, and how many of them were known before."""
-        return self._seen_in(level, coords), 0
+    def _found(self, level: int, coords: np.ndarray) -> tuple[Seen, np.ndarray]:
+        """Receivers on all surfaces in voxels of a level, with their light, and of those that were known before, which
+        come first, whether they have been looked at closer."""
+        return self._seen_in(level, coords), np.zeros(0, bool)
 
     def _seen_in(self, level: int, coords: np.ndarray) -> Seen:
         """Receivers in some of the tree's voxels of a level, traced."""

@@ -29,6 +29,9 @@ DARK = 0.1
 INSIDE = 0.9
 """Part of a receiver's linear weights that must lie in the cell itself for the receiver to have a say in the fit."""
 
+CLOSER, CLOSER_SEED = 4, 0xC105
+"""Paths that receivers get besides their own where an error may be too large but is not clear of noise; their seed."""
+
 HALVES = (0x51ED, 0xA11E)
 """Added to the seed for either half of the receivers' paths."""
 
@@ -153,6 +156,27 @@ def trace(scene: Scene, at: Receivers, effort: Effort, progress: Callable[[float
         found = reference.at(scene, at.position + scene.origin, at.normal, half, show, at.key)
         halves.append(stack(scene, found)[:, :, 0])
     return Seen(at, np.stack(halves))
+
+
+def trace_closer(scene: Scene, seen: Seen, effort: Effort) -> np.ndarray:
+    """Look at receivers once more, by more paths.
+
+    Parameters
+    ----------
+    scene : Scene
+        What light travels through.
+    seen : Seen
+        Receivers, as `trace` saw them.
+    effort : Effort
+        As they were traced.
+
+    Returns
+    -------
+    (2, n, functions, 3) float32 ndarray
+        Their light by all paths together.
+    """
+    more = dataclasses.replace(effort, samples=CLOSER * effort.samples, seed=effort.seed ^ CLOSER_SEED)
+    return (seen.light + CLOSER * trace(scene, seen.at, more).light) / (1 + CLOSER)
 
 
 def fitted(scene: Scene, state: State, judge: Judge, threads: int) -> np.ndarray:

@@ -120,7 +120,7 @@ def test_the_summary_says_what_the_check_found(tmp_path):
 
 
 def test_where_the_cache_is_too_far_off_the_bake_is_that_of_paths(tmp_path, monkeypatch):
-    around = job.radiosity.around
+    around = cell_job.radiosity.around
     bake(tmp_path / "paths", dataclasses.replace(SETTINGS, method="paths"))
     monkeypatch.setattr(cell_job.radiosity, "around", lambda *given: scaled(around(*given), 5.0))
     outcome = bake(tmp_path / "cache")

@@ -275,6 +275,21 @@ def test_trust_grows_with_noise_and_only_there():
     assert np.allclose(scaled, found, rtol=1e-3)
 
 
+@pytest.mark.parametrize("times", [1e-3, 10.0, 1e4])
+def test_trust_in_the_weight_around_does_not_depend_on_what_counts_elsewhere(times):
+    """Two data points that share no receiver; those of the second count more, or less."""
+    generator = np.random.default_rng(4)
+    row, basis = np.repeat([0, 1], 30)[:, None], harmonics.basis(directions(generator, 60))
+    traced = np.ones((2, 1, 9, 3), np.float32)
+    halves = generator.normal(1.0, 0.3, (2, 60, 1, 3)).astype(np.float32)
+
+    def first(counts) -> float:
+        system = System(2, row, np.ones((60, 1)), basis, counts)
+        return float(trust(system, traced, halves)[0] / (counts[0] / counts.mean()))
+
+    assert first(np.repeat([1.0, times], 30)) == pytest.approx(first(np.ones(60)), rel=1e-6)
+
+
 def test_trust_where_nothing_is_known_is_finite():
     system, traced = random_system(6, 50, counts=np.zeros(50)), random_values(6)
     for halves in (np.zeros((2, 50, 1, 3), np.float32), np.ones((2, 50, 1, 3), np.float32)):

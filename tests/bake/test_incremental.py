@@ -310,7 +310,7 @@ def test_suns_that_change_places_are_seen(tmp_path):
     again, whole, _ = both(simple(), simple(suns=((-1, 0, 1), (1, 0, 1))), tmp_path)
     cells = [folder.read_cell(target, (0, 0)) for target in (again, whole)]
     row = rows_in(*(cell.topology for cell in cells))
-    assert (row >= 0).mean() > 0.97
+    assert (row >= 0).mean() > 0.95
     for number in range(2):
         found, truth = (cell.payloads["sun"].values()[:, number] for cell in cells)
         found, truth = found[row >= 0], truth[row[row >= 0]]

@@ -48,7 +48,7 @@ def counts(parent: Measured | None, samples: int = 256, aim: float = 0.1) -> lis
     return measured._counts(parent, np.ones(3, np.uint8), coords, wanted).tolist()
 
 
-@pytest.mark.parametrize("samples", [64, 256])
+@pytest.mark.parametrize("samples", [64, 100, 256, 300])
 def test_noise_is_never_far_above_and_hardly_below_what_seeds_scatter_by(cell, samples):
     scene, grid, tree = cell
     runs = [measured.measure(scene, grid, tree, sampling(scene, samples, seed)) for seed in range(SEEDS)]
@@ -68,6 +68,17 @@ def test_the_noise_of_more_paths_is_given_as_that_of_the_usual_number(cell):
     ]
     few, many = (np.sqrt((noise**2).mean()) for noise in found)
     assert 0.6 < many / few < 1.1
+
+
+@pytest.mark.parametrize("samples", [1, 2, 1025])
+def test_a_lonely_sample_makes_no_data_point_black(cell, samples):
+    scene, grid, tree = cell
+    wanted = sampling(scene, samples, aim=0.01)
+    first = measured.measure(scene, grid, tree, wanted)
+    found = measured.measure(scene, grid, tree, wanted, measured.take(first, first.level == 0))
+    assert np.isfinite(found.noise).all()
+    assert (found.paths > 0).all()
+    assert (found.light[found.valid] != 0).any(axis=(1, 2, 3)).all()
 
 
 def test_children_of_noisy_parents_get_twice_the_paths_and_those_of_others_a_quarter():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from command_line import yard
@@ -59,6 +61,14 @@ def test_a_cell_grows_to_what_there_is_time_for_and_says_that_it_was_cut_short()
         assert made.cut == cut
         assert first <= made.state.tree.size <= points
     assert made.state.tree.size == whole
+
+
+def test_levels_without_voxels_are_no_trouble():
+    scene, found, judge, target = parts()
+    least = int(np.prod(found.dense.shape))
+    made = Refinement(scene, found, judge, dataclasses.replace(target, max_points=least), None)
+    assert made.run().tree.size == least
+    assert limited(1).state.tree.size >= least
 
 
 def test_progress_grows_from_0_to_at_most_1():
