@@ -366,9 +366,9 @@ def confidence(state: State) -> np.ndarray:
 def _system(state: State, judge: Judge) -> tuple[np.ndarray, fit.System | None]:
     """Receivers with a say, and how they see the data points.
 
-    They count by the inverse square of the light that data points bring there: what a bright place is wrong by must not
-    be made up for by a dark one beside it. Their own light would do worse, as those that look dark by chance would
-    count more.
+    They count by the inverse of the light that data points bring there: what a bright place is wrong by must not be
+    made up for by a dark one beside it, nor the other way round (by its inverse square, spots beside lamps came out
+    too dark). Their own light would do worse, as those that look dark by chance would count more.
     """
     at, data = state.seen.at, state.data
     row, weight = interpolate.weigh(data, at.position, at.normal)
@@ -383,7 +383,7 @@ def _system(state: State, judge: Judge) -> tuple[np.ndarray, fit.System | None]:
     plain = fit.System(len(data.valid), row[use], weight, basis, np.ones(len(use)))
     bright = fit.evaluate(plain, mean_view(state.measured.light, judge))[:, 0, 0].astype(np.float64)
     typical = float((bright * at.area[use]).sum() / at.area[use].sum())
-    counts = 1 / np.maximum(bright**2 + (DARK * typical) ** 2, 1e-30) if typical > 0 else np.ones(len(use))
+    counts = 1 / np.maximum(np.hypot(bright, DARK * typical), 1e-30) if typical > 0 else np.ones(len(use))
     return use, fit.System(len(data.valid), row[use], weight, basis, counts)
 
 

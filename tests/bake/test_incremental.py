@@ -320,7 +320,7 @@ def test_suns_that_change_places_are_seen(tmp_path):
 def test_another_strength_of_the_sun_decides_on_the_tree_anew(tmp_path):
     again, whole, _ = both(simple(strength=(1e-4, 1e-4)), simple(strength=(100.0, 100.0)), tmp_path)
     found, truth = (folder.read_cell(target, (0, 0)) for target in (again, whole))
-    assert abs(found.topology.size - truth.topology.size) < 0.01 * truth.topology.size
+    assert abs(found.topology.size - truth.topology.size) < 0.05 * truth.topology.size
     assert found.planes.shade == pytest.approx(truth.planes.shade, abs=0.05)
 
 
