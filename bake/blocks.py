@@ -9,17 +9,14 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..tree.grid import BRANCH, Grid
+from ..tree.grid import Grid
 from . import receivers
-from .measured import Measured
+from .measured import BRANCH_BITS, Measured
 
 __all__ = ["BLOCK", "Blocks", "by_level", "pool_keys", "pool_level", "pools", "voxels_of"]
 
 BLOCK = 2
 """Level of the voxels in which surfaces are compared: 0.5 m at human scale."""
-
-STEP = BRANCH.bit_length() - 1
-"""Binary digits of a coordinate that one level adds."""
 
 
 class Blocks:
@@ -133,7 +130,7 @@ def pool_keys(grid: Grid, measured: Measured) -> np.ndarray:
         Level of each data point, and its pool's voxel.
     """
     level = measured.level.astype(np.int64)
-    return np.column_stack([level, measured.coords >> (STEP * (level - pool_level(grid, level)))[:, None]])
+    return np.column_stack([level, measured.coords >> (BRANCH_BITS * (level - pool_level(grid, level)))[:, None]])
 
 
 def pools(grid: Grid, measured: Measured) -> list[tuple[int, np.ndarray]]:
@@ -195,4 +192,4 @@ def by_level(judge: Callable[[int, np.ndarray], np.ndarray], measured: Measured)
 
 def _up(coords: np.ndarray, levels: int) -> np.ndarray:
     """Ancestors of voxels so many levels up; they themselves for none or fewer."""
-    return coords >> (STEP * max(levels, 0))
+    return coords >> (BRANCH_BITS * max(levels, 0))

@@ -17,11 +17,9 @@ import numpy as np
 from ..tree import build, interpolate
 from ..tree.blend import ENOUGH
 from ..tree.dualcells import CORNERS
-from ..tree.grid import Grid
 from ..tree.lookup import Atlas
 from ..tree.outline import Outline
 from ..tree.region import finder
-from ..tree.topology import Topology
 from . import cracks, hidden, occluders, parallel, receivers
 from .deadline import Pace
 from .gather import Effort
@@ -338,7 +336,9 @@ class Refinement:
 
     def _hide(self, at: Receivers) -> None:
         """Planes for all data points, as receivers with light see them, which are there anyway."""
-        self._fit_planes(at.take(self._near(at)))
+        parallel.check()
+        found = occluders.fit(self.scene, self.state.data, at.take(self._near(at)), self.target.effort.threads)
+        self._set_planes(found.planes, found.plane)
 
     def _hide_midway(self) -> None:
         """Planes for all data points, as dense receivers on all surfaces see them that the cell may light, those of
@@ -358,12 +358,6 @@ class Refinement:
         """Planes of before, but for some data points, and those around whatever is new, gone, or elsewhere."""
         parallel.check()
         self._set_planes(*hidden.since(self.scene, self.state, old, new, self.target.effort.threads))
-
-    def _fit_planes(self, at: Receivers) -> None:
-        """Planes as some receivers see the data points."""
-        parallel.check()
-        found = occluders.fit(self.scene, self.state.data, at, self.target.effort.threads)
-        self._set_planes(found.planes, found.plane)
 
     def _set_planes(self, planes: np.ndarray, plane: np.ndarray) -> None:
         """Give the data points their planes."""
@@ -405,13 +399,14 @@ class Refinement:
         """(m, 3) missing voxels in front of receivers that hardly any data point lights, and that are wrong for it:
         a thin surface has two sides, and the data point of its voxel is on one of them."""
         at, tree, size = self.state.seen.at, self.state.tree, float(self.grid.voxel_size(level))
-        chosen = _voxels_of(self.grid, tree, level)(at.position) & (confidence(self.state) < WEAK)
+        atlas = Atlas([tree])
+        chosen = (atlas.find(level, self.grid.voxels_at(level, at.position)) >= 0) & (confidence(self.state) < WEAK)
         chosen &= self._wrong()
         position, normal = at.position[chosen], at.normal[chosen]
         corner = np.floor(position / size - 0.5).astype(np.int64)[:, None] + CORNERS
         height = np.einsum("nci,ni->nc", (corner + 0.5) * size - position[:, None], normal)
         corner = np.unique(corner[height > FRONT * size], axis=0)
-        return corner[Atlas([tree]).find(level, corner) < 0]
+        return corner[atlas.find(level, corner) < 0]
 
     def _wrong(self) -> np.ndarray:
         """(n,) receivers whose error is too large to be noise."""
@@ -445,9 +440,3 @@ class Refinement:
         count = 4 * levels + 2
         self.stage += 1
         return None if show is None else lambda share: show((stage + share) / count)
-
-
-def _voxels_of(grid: Grid, tree: Topology, level: int) -> Callable[[np.ndarray], np.ndarray]:
-    """A function that says which positions lie in a tree's voxels of a level."""
-    atlas = Atlas([tree])
-    return lambda position: atlas.find(level, grid.voxels_at(level, position)) >= 0

@@ -379,12 +379,11 @@ def _system(state: State, judge: Judge) -> tuple[np.ndarray, fit.System | None]:
     if not len(use):
         return use, None
     basis = harmonics.basis(at.normal[use].astype(np.float64))
-    weight = weight[use] / total[use, None]
-    plain = fit.System(len(data.valid), row[use], weight, basis, np.ones(len(use)))
+    plain = fit.System(len(data.valid), row[use], weight[use] / total[use, None], basis, np.ones(len(use)))
     bright = fit.evaluate(plain, mean_view(state.measured.light, judge))[:, 0, 0].astype(np.float64)
     typical = float((bright * at.area[use]).sum() / at.area[use].sum())
-    counts = 1 / np.maximum(np.hypot(bright, DARK * typical), 1e-30) if typical > 0 else np.ones(len(use))
-    return use, fit.System(len(data.valid), row[use], weight, basis, counts)
+    counts = 1 / np.maximum(np.hypot(bright, DARK * typical), 1e-30) if typical > 0 else plain.receiver
+    return use, dataclasses.replace(plain, receiver=counts)
 
 
 def _fit(system: fit.System, traced: np.ndarray, halves: np.ndarray, threads: int) -> np.ndarray:
