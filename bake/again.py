@@ -7,6 +7,8 @@ and errors and planes are looked at only around the others.
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from ..tree import interpolate
@@ -14,10 +16,10 @@ from ..tree.grid import Grid
 from ..tree.lookup import Atlas
 from ..tree.outline import Outline
 from ..tree.region import finder
-from . import changes, receivers
+from . import changes, hidden, parallel, receivers
 from .blocks import by_level
 from .changes import Past
-from .hidden import Hidden, rows_in
+from .hidden import rows_in
 from .measured import Measured, join, move, take
 from .memory import Memory
 from .receivers import Receivers
@@ -25,7 +27,7 @@ from .refine import Refinement, Target
 from .scene import Scene
 from .survey import Judge, Seen, State
 
-__all__ = ["Again", "remember", "settled"]
+__all__ = ["Again", "refreshed", "remember", "settled"]
 
 RINGS = 2
 """How far around receivers that are decided on others are looked at: receivers that share a data point, twice."""
@@ -139,20 +141,21 @@ class Again(Refinement):
         return np.where(by_level(self.past.decide.touch, some), -1, row)
 
     def _hide_midway(self) -> None:
-        """Planes of before where nothing is decided; others anew."""
-        measured = self.state.measured
-        new = by_level(self.past.decide.touch, measured) | self._beside_surfaces()
-        self._hide_since(self._hidden_before(), new)
+        """Planes of before where nothing is decided, with data points in cracks where they were; others anew."""
+        parallel.check()
+        there = self._in_cracks()
+        new = by_level(self.past.decide.touch, there.measured) | self._beside_surfaces()
+        old = hidden.of_memory(self.memory)
+        self.hidden = hidden.since(self.scene, there, old, new, self.target.effort.threads)
+        self._set_planes(self.hidden.planes, self.hidden.plane)
 
-    def _hide_finally(self) -> None:
-        """Planes of before where neither tree nor surfaces have changed, nor data points been moved; others anew."""
-        self._hide_since(self._hidden_before(), self._beside_surfaces())
-
-    def _hidden_before(self) -> Hidden:
-        """Planes of before, with the data points where they were in the end."""
-        memory = self.memory
-        there = move(memory.measured, memory.moved.row, memory.moved.offset, memory.moved.light)
-        return Hidden(memory.tree, there, memory.planes, memory.plane)
+    def _in_cracks(self) -> State:
+        """The state with those data points moved that are likely to move again."""
+        row, moved, state = self._rows_of_moved(), self.memory.moved, self.state
+        kept = np.flatnonzero(row >= 0)
+        measured = move(state.measured, row[kept], moved.offset[kept], moved.light[kept])
+        data = interpolate.join(self.grid, [state.tree], measured.offset, measured.valid)
+        return State(state.tree, measured, data, state.seen)
 
     def _beside_surfaces(self) -> np.ndarray:
         """(points,) which data points have, or light, surfaces that have changed."""
@@ -163,30 +166,37 @@ class Again(Refinement):
         return new
 
 
-def settled(past: Past, grid: Grid) -> State:
+def settled(past: Past, scene: Scene, grid: Grid, threads: int = 0) -> State:
     """Give a cell the light of today where its tree stays as it is.
 
     Parameters
     ----------
     past : Past
         Without anything to decide.
+    scene : Scene
+        As it is now.
     grid : Grid
         The lattice.
+    threads : int
+        As in `Effort`.
 
     Returns
     -------
     State
-        As it was, with other light.
+        As it was, with other light, and other planes before surfaces beyond its border that have changed.
     """
     memory = past.memory
-    measured = memory.measured
-    if len(memory.moved.row):
-        measured = move(measured, memory.moved.row, memory.moved.offset, memory.moved.light)
-    data = interpolate.join(grid, [memory.tree], measured.offset, measured.valid, memory.planes, memory.plane)
+    old = hidden.of_memory(memory)
+    data = interpolate.join(grid, [memory.tree], old.measured.offset, old.measured.valid, memory.planes, memory.plane)
     seen = memory.looks[0].seen
     for look in memory.looks[1:]:
         seen = seen.plus(look.seen)
-    return State(memory.tree, measured, data, seen.take(memory.current))
+    state = State(memory.tree, old.measured, data, seen.take(memory.current))
+    new = changes.lights(past.beyond, memory.tree, old.measured)
+    if not new.any():
+        return state
+    found = hidden.since(scene, state, old, new, threads)
+    return dataclasses.replace(state, data=dataclasses.replace(data, planes=found.planes, plane=found.plane))
 
 
 def remember(made: Refinement, causes: dict[str, str], rules: str, past: Past | None) -> Memory:
@@ -225,4 +235,37 @@ def remember(made: Refinement, causes: dict[str, str], rules: str, past: Past | 
     own = made.unmoved, made.moved, paths, made.looks, current, need, made.asked
     return Memory(
         state.tree, *own, state.data.planes, state.data.plane, *surfaces, scene.cache is not None, causes, rules
+    )
+
+
+def refreshed(past: Past, state: State, scene: Scene, causes: dict[str, str]) -> Memory:
+    """Put the same together for a cell whose tree stays as it is.
+
+    Parameters
+    ----------
+    past : Past
+        What was known before.
+    state : State
+        From `settled`.
+    scene : Scene
+        As it is now.
+    causes : dict of str to str
+        From `changes.causes`.
+
+    Returns
+    -------
+    Memory
+        Without the digest of its files.
+    """
+    corners, opaque = past.memory.corners, past.memory.opaque
+    if past.beyond:
+        corners, opaque = changes.triangles_near(scene, state.data.grid, state.tree.cell)
+    return dataclasses.replace(
+        past.memory,
+        pilot=past.pilot,
+        planes=state.data.planes,
+        plane=state.data.plane,
+        corners=corners,
+        opaque=opaque,
+        causes=causes,
     )

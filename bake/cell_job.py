@@ -20,7 +20,7 @@ from ..tree.outline import Outline, outline
 from ..tree.planes import of_cell
 from ..tree.topology import Topology
 from . import changes, memory, radiosity
-from .again import Again, remember, settled
+from .again import Again, refreshed, remember, settled
 from .check import VOXELS, Check, check
 from .deadline import Deadline
 from .fills import fills
@@ -303,9 +303,9 @@ def _bake_again(work: Work, known: memory.Memory, show: Callable[[float], bool])
         work.kept[cell] = past.kept
         work.arriving[cell] = {name for name, part in copied.payloads.items() if part.table.coefficient.any()}
         return known.tree
-    if not (past.decide or past.beyond):
-        refined = settled(past, work.grid)
-        made = dataclasses.replace(past.memory, pilot=past.pilot, causes=now)
+    if not past.decide:
+        refined = settled(past, scene, work.grid, effort.threads)
+        made = refreshed(past, refined, scene, now)
     else:
         found = outline(work.scene.soup.corners, work.grid, cell, by_light=work.target.error > 0)
         again = Again(scene, found, work.judge, work.target, show, past)

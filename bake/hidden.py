@@ -15,7 +15,8 @@ from ..tree.lookup import Atlas
 from ..tree.topology import Topology
 from . import judges, occluders, receivers
 from .blocks import BLOCK, Blocks, by_level, voxels_of
-from .measured import Measured, take
+from .measured import Measured, move, take
+from .memory import Memory
 from .receivers import Receivers
 from .scene import Scene
 from .survey import State
@@ -60,7 +61,25 @@ def everywhere(scene: Scene, state: State, threads: int) -> Hidden:
     return Hidden(state.tree, state.measured, found.planes, found.plane)
 
 
-def since(scene: Scene, state: State, old: Hidden, new: np.ndarray, threads: int) -> tuple[np.ndarray, np.ndarray]:
+def of_memory(memory: Memory) -> Hidden:
+    """Take what an earlier bake found.
+
+    Parameters
+    ----------
+    memory : Memory
+        The cell.
+
+    Returns
+    -------
+    Hidden
+        With its data points where they were in the end.
+    """
+    moved, measured = memory.moved, memory.measured
+    there = move(measured, moved.row, moved.offset, moved.light) if len(moved.row) else measured
+    return Hidden(memory.tree, there, memory.planes, memory.plane)
+
+
+def since(scene: Scene, state: State, old: Hidden, new: np.ndarray, threads: int) -> Hidden:
     """Keep planes of before, but for some data points, and those around whatever is new, gone, or elsewhere.
 
     Parameters
@@ -78,8 +97,8 @@ def since(scene: Scene, state: State, old: Hidden, new: np.ndarray, threads: int
 
     Returns
     -------
-    planes, plane : ndarray
-        As in `Occluders`.
+    Hidden
+        As it is now.
     """
     tree, measured = state.tree, state.measured
     new = new | by_level(_changed(state, old).beside, measured)
@@ -90,7 +109,7 @@ def since(scene: Scene, state: State, old: Hidden, new: np.ndarray, threads: int
         found = occluders.fit(scene, data, _judges(scene, state, new, threads), threads, only=new)
         planes[new] = np.where(found.planes[new] >= 0, found.planes[new] + len(plane), -1)
         plane = np.concatenate([plane, found.plane])
-    return _distinct(planes, plane)
+    return Hidden(tree, measured, *_distinct(planes, plane))
 
 
 def rows_in(tree: Topology, other: Topology) -> np.ndarray:

@@ -350,14 +350,11 @@ class Refinement:
     def _hide_finally(self) -> None:
         """The same for what has changed since."""
         if self.hidden is None:
-            self._hide_midway()
-        else:
-            self._hide_since(self.hidden, np.zeros(self.state.tree.size, bool))
-
-    def _hide_since(self, old: Hidden, new: np.ndarray) -> None:
-        """Planes of before, but for some data points, and those around whatever is new, gone, or elsewhere."""
+            return self._hide_midway()
         parallel.check()
-        self._set_planes(*hidden.since(self.scene, self.state, old, new, self.target.effort.threads))
+        none = np.zeros(self.state.tree.size, bool)
+        found = hidden.since(self.scene, self.state, self.hidden, none, self.target.effort.threads)
+        self._set_planes(found.planes, found.plane)
 
     def _set_planes(self, planes: np.ndarray, plane: np.ndarray) -> None:
         """Give the data points their planes."""

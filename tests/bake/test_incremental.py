@@ -241,7 +241,7 @@ def test_a_settled_cell_is_the_cell_that_was_refined(first):
     past = changes.compare(known, scene, grid, causes, Effort(64, 4, 0, 1), 32)
     assert not past.changed
     assert not past.decide
-    state = settled(past, grid)
+    state = settled(past, scene, grid)
     cell = folder.read_cell(first, (0, 0))
     assert np.array_equal(state.measured.offset[cell.valid], cell.offset[cell.valid])
     assert np.array_equal(state.tree.nodes, cell.topology.nodes)
