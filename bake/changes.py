@@ -211,8 +211,9 @@ def compare(memory: Memory, scene: Scene, grid: Grid, now: dict[str, str], effor
         if now[name] != memory.causes[name]:
             alone |= known & _is_unseen(memory, paths, columns[name])
     stale = wide | alone
-    restless = pools(grid, take(measured, known & ~(pooled <= DECIDE).all(axis=1)))
-    decide = Blocks([*surfaces.marks, *((int(pool_level(grid, level)), coords) for level, coords in restless)])
+    restless = known & _bear(memory.tree, measured) & ~(pooled <= DECIDE).all(axis=1)
+    decide = [(int(pool_level(grid, level)), coords) for level, coords in pools(grid, take(measured, restless))]
+    decide = Blocks([*surfaces.marks, *decide])
     if now["judge"] != memory.causes["judge"]:
         decide = Blocks([(0, measured.coords[measured.level == 0])])
     paths[~stale] = memory.pilot[~stale]
@@ -361,9 +362,14 @@ def lights(surfaces: Blocks, tree: Topology, measured: Measured) -> np.ndarray:
     Returns
     -------
     (size,) bool ndarray
-        Those close by; of the first level only leaves, as others bring next to nothing.
+        Those close by.
     """
-    return ((measured.level > 0) | tree.leaves) & by_level(surfaces.around, measured)
+    return _bear(tree, measured) & by_level(surfaces.around, measured)
+
+
+def _bear(tree: Topology, measured: Measured) -> np.ndarray:
+    """(size,) data points that surfaces are lit by: of the first level only leaves, as others bring next to nothing."""
+    return (measured.level > 0) | tree.leaves
 
 
 def _misplaced(memory: Memory, scene: Scene, grid: Grid, known: np.ndarray) -> list[tuple[int, np.ndarray]]:
