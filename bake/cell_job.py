@@ -245,9 +245,13 @@ def look_early(work: Work, cell: tuple[int, int], grid: Grid) -> None:
     quick = dataclasses.replace(work.target, error=0.0, effort=effort, samples=RECEIVER_SAMPLES)
     found = outline(work.scene.soup.corners, grid, cell)
     _check_cap(found, quick.max_points)
-    refined = sketch(work.scene, found, work.judge, quick)
-    tree = dataclasses.replace(refined.tree, levels=work.grid.levels)
-    _write(work, cell, dataclasses.replace(refined, tree=tree), early=True)
+
+    def sketched(target: Target, attempt: int, limit: int) -> tuple[int, int]:
+        refined = sketch(work.scene, found, work.judge, target)
+        tree = dataclasses.replace(refined.tree, levels=work.grid.levels)
+        return tree.size, _write(work, cell, dataclasses.replace(refined, tree=tree), limit, early=True)
+
+    _in_budget(found, quick, work.settings.max_bytes, sketched)
 
 
 def bake_cell(work: Work, cell: tuple[int, int], show: Callable[[float], bool]) -> Topology:
@@ -327,18 +331,17 @@ def _fill_cell(work: Work, cell: tuple[int, int], found: Outline, show: Callable
     scene = work.trusted(work.light_in(voxels, show), voxels)
     if found.cell in work.checks:
         whole, show = show, lambda share: whole(CACHED + (1 - CACHED) * share)
-    cut = False
-    for attempt in range(BUDGET_TRIES):
-        last = attempt == BUDGET_TRIES - 1
+    made, cut = None, False
+
+    def refined(target: Target, attempt: int, most: int) -> tuple[int, int]:
+        nonlocal made, cut
         made = Refinement(scene, found, work.judge, target, _part_of(show, attempt) if limit else show)
         made.pace = work.deadline.pace()
-        refined = made.run()
+        state = made.run()
         cut |= made.cut
-        size = _write(work, cell, refined, limit=0 if last else limit, early=cut)
-        if last or not limit or size <= limit:
-            break
-        points = int(made.state.tree.size * BUDGET_MARGIN * limit / size)
-        target = dataclasses.replace(target, max_points=max(points, int(np.prod(found.dense.shape)) + 1))
+        return state.tree.size, _write(work, cell, state, most, early=cut)
+
+    size = _in_budget(found, target, limit, refined)
     if limit and size > limit:
         work.warnings.append(f"cell {list_of([cell])} takes {size:,} bytes, {size - limit:,} more than --max-bytes")
     if cut:
@@ -346,6 +349,23 @@ def _fill_cell(work: Work, cell: tuple[int, int], found: Outline, show: Callable
     elif work.history:
         _keep(work, remember(made, work.history.causes, work.history.rules, None))
     return made.state.tree
+
+
+def _in_budget(
+    found: Outline, target: Target, limit: int, attempted: Callable[[Target, int, int], tuple[int, int]]
+) -> int:
+    """Bake a cell with as many data points as its bytes allow; its bytes.
+
+    `attempted(target, attempt, limit)` returns data points and bytes, and writes no files of more than so many bytes;
+    0 for any number of them.
+    """
+    for attempt in range(BUDGET_TRIES):
+        last = attempt == BUDGET_TRIES - 1
+        count, size = attempted(target, attempt, 0 if last else limit)
+        if last or not limit or size <= limit:
+            return size
+        points = int(count * BUDGET_MARGIN * limit / size)
+        target = dataclasses.replace(target, max_points=max(points, int(np.prod(found.dense.shape)) + 1))
 
 
 def _keep(work: Work, made: memory.Memory) -> None:

@@ -27,6 +27,8 @@ from gi_volumes.tree import container
 from statistics_checks import standard_error
 
 CELLS = 3
+FEW_BYTES = 5500
+"""What a cell of the row may take: less than its early look, which has 6,300."""
 
 
 @pytest.fixture(scope="module")
@@ -525,3 +527,15 @@ def test_a_bake_without_the_command_line_refuses_the_same_folders(tmp_path):
     (tmp_path / "world.json").write_text("[]")
     with pytest.raises(SettingsError, match="another program's file"):
         job.bake(yard(), tmp_path, Settings(1, 1, finest=8))
+
+
+def test_cells_that_time_was_too_short_for_keep_to_their_bytes(row, tmp_path):
+    def sizes(*limits: str) -> list[int]:
+        succeed("bake", row, "-o", tmp_path, *QUICK, *limits)
+        return [sum(path.stat().st_size for path in tmp_path.glob(f"cell_{i}_0.*")) for i in range(CELLS)]
+
+    assert min(sizes("--minutes", "1e-9")) > FEW_BYTES
+    assert max(sizes("--max-bytes", str(FEW_BYTES), "--minutes", "1e-9")) <= FEW_BYTES
+    assert len(call("verify", tmp_path, "--json").object["defects"]) == CELLS
+    assert max(sizes("--max-bytes", str(FEW_BYTES))) <= FEW_BYTES
+    assert call("verify", tmp_path, "--json").object["defects"] == []
