@@ -27,6 +27,9 @@ ROULETTE_START = 3
 GRAZING = np.float32(1e-6)
 """Least cosine of a density, so that no weight divides zero by zero."""
 
+CERTAIN = np.float32(1e30)
+"""Density of a direction that was not drawn by chance but looked in: what lies there counts in full."""
+
 # Dimensions of the random numbers. The first two choose the path's first direction.
 FIRST_VERTEX = 2
 SCATTER, LAMP, EMITTER, SKY, PER_VERTEX = 0, 2, 6, 9, 12
