@@ -15,7 +15,7 @@ import numpy as np
 
 from ..tree import octahedral, probe_maps
 from ..tree.probe_atlas import put
-from ..tree.probe_maps import ProbeMaps
+from ..tree.probe_maps import ProbeMaps, rounded
 from .gather import Effort
 from .lamps import LUMINANCE
 from .panorama import Panorama, Seen
@@ -34,8 +34,8 @@ FIRST_RAYS = 4
 HALVES = 2
 """Independent halves of a texel's rays."""
 
-LARGEST = np.float32(65504)
-"""Largest number of half precision."""
+FARTHEST = np.float32(65504)
+"""Longest distance of half precision [m]; beyond, all is as far as the sky."""
 
 
 @dataclass(frozen=True)
@@ -158,8 +158,8 @@ def shoot(scene: Scene, studio: Studio, rows: np.ndarray, progress: Callable[[in
     Notes
     -----
     Error: noise as `Spending` says, where that takes no more than `most` rays; what a surface cache is off by, one
-    bounce on; radiance is rounded to half precision, by 2**-12 of it, and held at 65504. Tested against closed forms
-    and plain path tracing in `tests/bake/test_capture.py`.
+    bounce on; rounding (`probe_maps.rounded`). Tested against closed forms and plain path tracing in
+    `tests/bake/test_capture.py`.
     """
     size = studio.maps.layout.sizes[0]
 
@@ -201,7 +201,7 @@ def _put_radiance(studio: Studio, row: int, light: np.ndarray) -> None:
     """Blur a probe's maps and write all levels."""
     maps, size = studio.maps, studio.blur.size
     for level, image in enumerate(studio.blur(light.reshape(size, size, -1))):
-        image = np.clip(image, -LARGEST, LARGEST).astype(np.float16)
+        image = rounded(image)
         for part, atlases in enumerate(maps.radiance.values()):
             put(atlases[level], maps.layout, level, row, image[:, :, 3 * part : 3 * part + 3])
 
@@ -209,7 +209,7 @@ def _put_radiance(studio: Studio, row: int, light: np.ndarray) -> None:
 def _put_surfaces(maps: ProbeMaps, row: int, seen: Seen) -> None:
     """Write what lies behind a probe's texels."""
     size = maps.layout.sizes[0]
-    distance = np.where(seen.distance > LARGEST, np.float32(np.inf), seen.distance)
+    distance = np.where(seen.distance > FARTHEST, np.float32(np.inf), seen.distance)
     put(maps.distance, maps.layout, 0, row, distance.reshape(size, size).astype(np.float16))
     put(maps.normal, maps.layout, 0, row, seen.normal.T.reshape(size, size, 3).astype(np.float16))
-    put(maps.albedo, maps.layout, 0, row, seen.albedo.T.reshape(size, size, 3).astype(np.float16))
+    put(maps.albedo, maps.layout, 0, row, rounded(np.ascontiguousarray(seen.albedo.T)).reshape(size, size, 3))
