@@ -44,6 +44,7 @@ __all__ = [
     "files",
     "grid_of",
     "has_cell",
+    "list_again",
     "load_header",
     "read_cell",
     "write_cell",
@@ -94,11 +95,34 @@ def assemble(folder: str | os.PathLike, header: dict) -> dict:
     content = header | {"format": WORLD_FORMAT, "version": WORLD_VERSION, "grid": lattice, "cells": cells}
     content["bounds"] = _bounds([entry["bounds"] for entry in cells])
     probes = describe(folder) or {}
+    content.pop("probes", None)
     content |= {"probes": probes} if probes.get("bake") == header["bake"] else {}
     content = json.loads(json.dumps(content, allow_nan=False))
     content["checksum"] = _checksum(content)
     write_bytes_atomically(Path(folder) / WORLD, _to_text(content))
     return content
+
+
+def list_again(folder: str | os.PathLike) -> dict:
+    """Write `world.json` anew: it lists what has come and gone since.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Folder of a bake.
+
+    Returns
+    -------
+    dict
+        What `load_header` will return.
+
+    Raises
+    ------
+    FileError, OSError
+        When it cannot be read, or written.
+    """
+    header = load_header(folder)
+    return assemble(folder, header | {"grid": grid_of(header)})
 
 
 def load_header(folder: str | os.PathLike) -> dict:
