@@ -1,8 +1,8 @@
 """What one place sees all around, texel by texel of an octahedral map: radiance, and the surfaces behind the texels.
 
 Comes in: a scene, a place. Goes out: sums of radiance over rays that are spread over each texel, all transports from
-the same paths; distance, normal and reflectance where a ray through a texel's middle ends. Surfaces that shine and the
-sky are seen as they are; lamps are no surfaces, and the sun's disk isn't there: engines show both by themselves. Direct
+the same paths; distance, normal and reflectance where a ray through a texel's middle ends. Surfaces that shine, lamps
+that are marked as reflectors and the sky are seen as they are; other lamps and the sun's disk are the engine's. Direct
 light is looked for where a ray ends, as mirrors show the edges of shadows; a surface cache is asked one bounce further
 on, where its grain doesn't show.
 """
@@ -19,11 +19,11 @@ from . import paths
 from .gather import seeded
 from .lit_spots import LitSpots
 from .parallel import tile_size
-from .paths import CERTAIN, Numbers, Wave
+from .paths import CERTAIN, Numbers, Radiance, Wave
 from .rays import MISS
 from .scene import Scene
 from .sobol import Sampler, scramble
-from .visibility import meet
+from .visibility import TARGET_SHORTENED, meet, unblocked
 
 __all__ = ["Light", "Panorama", "Seen"]
 
@@ -173,6 +173,7 @@ class Panorama:
         numbers, lanes = Numbers(sampler, point, sample), np.arange(len(point))
         direction = self._toward(texel[point], *numbers.draw(lanes, 0, 2))
         light, lane, vertex = paths.look(self._scene, self._rays(direction), numbers)
+        self._add_reflectors(light, direction)
         straight, reflectance = light.stacked(), np.zeros((3, len(lanes)), np.float32)
         reflectance[:, lane] = vertex.reflectance
         bounced = np.zeros_like(straight)
@@ -182,6 +183,18 @@ class Panorama:
             found = paths.arriving(self._scene, vertex, numbers, self._bounces, self._scene.cache)
             bounced[:, :, lane] = found.stacked()
         return straight, bounced, reflectance
+
+    def _add_reflectors(self, light: Radiance, direction: np.ndarray) -> None:
+        """Lamps that are baked only: no engine shows them."""
+        reflectors = self._scene.reflectors if self._scene.model.local else None
+        for lamp in range(reflectors.count if reflectors else 0):
+            origin = np.repeat(self._place, direction.shape[1], axis=1)
+            distance, radiance = reflectors.along(lamp, origin, direction)
+            met = np.flatnonzero(distance)
+            shadow = np.full(len(met), reflectors.shadow[lamp])
+            segments = origin[:, met], direction[:, met] * distance[met]
+            rows, tint = unblocked(self._scene, *segments, TARGET_SHORTENED, distance[met] > 0, shadow)
+            light.local[:, met[rows]] += radiance[:, met[rows]] * tint
 
     def _rays(self, direction: np.ndarray) -> Wave:
         """Paths from the place."""

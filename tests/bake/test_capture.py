@@ -15,7 +15,7 @@ from gi_volumes.bake.gather import Effort
 from gi_volumes.bake.parallel import CancelledError
 from gi_volumes.bake.rays import MISS
 from gi_volumes.bake.scene import Model, Scene, SunDirections, prepare
-from gi_volumes.bake.snapshot import Channel, Material
+from gi_volumes.bake.snapshot import Channel, LightKind, Material
 from gi_volumes.tree import octahedral, probe_maps
 from gi_volumes.tree.grid import Grid
 from gi_volumes.tree.probe_atlas import fetch
@@ -202,6 +202,27 @@ def test_a_point_lamp_is_not_seen_itself():
     studio = taken(scene, (2, 2, 2), bounces=4)
     assert not np.any(studio.maps.radiance["local"][0])
     assert studio.noise[0] == 0
+
+
+@pytest.mark.parametrize(("reflector", "seen"), [(True, 5.0), (False, 0.0)])
+def test_a_lamp_is_seen_if_it_is_baked_only_and_nothing_hides_it(reflector, seen):
+    room = build_scenes.box((0, 0, 0), (4, 4, 4), inward=True)
+    screen = build_scenes.box((1, 1, 2.9), (2, 3, 3))
+    panel = {"kind": LightKind.RECTANGLE, "position": (2, 2, 3.5), "size": (2, 2), "strength": (5, 5, 5)}
+    lights = build_scenes.lamps(panel | {"reflector": reflector})
+    scene = prepare(build_scenes.snapshot([(room, matte(0)), (screen, matte(0))], lights), Model())
+    place = np.array([2.0, 2.0, 1.0])
+    studio = taken(scene, place)
+    toward = within_texels(30)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        at = place + toward * (2.5 / toward[..., 2:])
+    up, shown = toward[..., 2] > 0, map_of(studio, studio.maps.radiance["local"][0])[..., 0]
+    met = up & (np.abs(at[..., :2] - 2) < 1).all(axis=-1)
+    free, hidden = met & (at[..., 0] > 2.01), met & (at[..., 0] < 1.9)
+    assert min(free.all(axis=-1).sum(), hidden.all(axis=-1).sum()) > 10
+    assert shown[free.all(axis=-1)] == pytest.approx(seen, rel=ROUNDING)
+    assert not shown[hidden.all(axis=-1)].any()
+    assert not shown[~met.any(axis=-1)].any()
 
 
 @pytest.mark.parametrize("alpha", [0.25, 0.75])
