@@ -21,13 +21,15 @@ from ..tree.grid import Grid
 from ..tree.probe_atlas import Layout
 from ..tree.topology import Topology
 from . import radiosity
-from .capture import Spending, Studio, shoot
+from .capture import FIRST_RAYS, HALVES, Spending, Studio, shoot
 from .gather import Effort
+from .glossiness import ROUGH, glossy_share
 from .patches import Forest
 from .probes import LEAST_GAIN, Request, place
 from .scene import Scene
+from .settings import ERRORS, Settings
 
-__all__ = ["Job", "Made", "Wish", "probe_bytes", "run"]
+__all__ = ["AUTOMATIC", "Job", "Made", "Wish", "probe_bytes", "run", "spending_of", "why_none"]
 
 FORMAT = "gi_volumes probes 1"
 """Part of every file's hash: probes of another definition are captured anew."""
@@ -37,6 +39,16 @@ PLACED, CACHED = 0.1, 0.1
 
 WORTH = 1 << 20
 """Rays of a cell's probes below which paths are followed to their end: a surface cache takes as long."""
+
+AUTOMATIC = 32.0
+"""Most that maps take where nobody says otherwise [MB]: 51 probes of a lamp, a sun and a sky. They take about as long
+as the cells, and show two thirds of what ever so many would (`docs/accuracy.md`, *Reflection probes*)."""
+
+LEAST_GLOSSY = 0.01
+"""Part of the surfaces that has to be glossy for probes to be made where nobody asks for them."""
+
+PATHS = 2
+"""Paths of a data point for each ray of a texel, at most."""
 
 SURFACE_BYTES = 2 + 6 + 6
 """Distance, normal and albedo of a texel."""
@@ -52,6 +64,7 @@ class Wish:
     spending : Spending, how good maps are to be
     pinned : (m, 3) float64, probes that are there anyway, world coordinates [m]
     deleted : (b, 2, 3) float64, lowest and highest corners of boxes that get no others, world coordinates [m]
+    only_if_glossy : whether there are to be none where hardly any surface shows reflections
     """
 
     count: int = 1000
@@ -60,6 +73,7 @@ class Wish:
     spending: Spending = field(default_factory=Spending)
     pinned: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     deleted: np.ndarray = field(default_factory=lambda: np.zeros((0, 2, 3)))
+    only_if_glossy: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +121,44 @@ class Made:
     kept: bool = False
     rays: float = 0.0
     noise: float = 0.0
+
+
+def spending_of(settings: Settings) -> Spending:
+    """Say how good maps are to be.
+
+    Parameters
+    ----------
+    settings : Settings
+        Of the bake.
+
+    Returns
+    -------
+    Spending
+        Half of its error, as noise of a mirror shows; with at most half as many rays as a data point has paths.
+    """
+    error = (settings.error or ERRORS["preview"]) / 2
+    return Spending(error, max(settings.samples // PATHS, HALVES * FIRST_RAYS))
+
+
+def why_none(job: Job) -> str:
+    """Say why a bake needs no probes.
+
+    Parameters
+    ----------
+    job : Job
+        What they would be made of.
+
+    Returns
+    -------
+    str
+        In words; empty where it does.
+    """
+    if not job.parts:
+        return "there is no light to reflect"
+    share = glossy_share(job.scene) if job.wish.only_if_glossy else 1.0
+    if share >= LEAST_GLOSSY:
+        return ""
+    return f"{100 * share:.1f} % of all surfaces are smoother than roughness {ROUGH}; --probes N makes them anyway"
 
 
 def run(job: Job, show: Callable[[float], bool] = lambda share: True) -> Made:

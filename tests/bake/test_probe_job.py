@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import shutil
 from pathlib import Path
 
 import build_scenes
 import numpy as np
 import pytest
-from gi_volumes.bake import probe_job, radiosity
+from command_line import QUICK, call, stored, succeed
+from gi_volumes.bake import cli, probe_job, radiosity
 from gi_volumes.bake.capture import Spending
 from gi_volumes.bake.gather import Effort
-from gi_volumes.bake.job import bake
+from gi_volumes.bake.job import Manner, bake
 from gi_volumes.bake.parallel import CancelledError
 from gi_volumes.bake.probe_job import Job, Made, Wish, probe_bytes, run
 from gi_volumes.bake.probes import RequestError
@@ -175,7 +177,8 @@ def test_another_bake_of_the_folder_removes_its_probes(target):
 def test_the_same_bake_again_keeps_its_probes(target):
     run(job_of(target, hall(0.2)))
     before = bytes_in(target)
-    bake(hall(0.2), target, SETTINGS)
+    manner = Manner(threads=1, probes=job_of(target, hall(0.2)).wish)
+    assert bake(hall(0.2), target, SETTINGS, manner=manner).probes["count"] == 3
     assert bytes_in(target) == before
 
 
@@ -192,3 +195,62 @@ def test_a_large_scene_has_a_cache_for_each_cell(tmp_path, monkeypatch):
     assert cells.tolist() == [0, 1]
     assert sorted(box[0, 0] // 128 for box in boxes) == [0, 1]
     assert maps.radiance["local"][0].astype(float).mean() > 0
+
+
+def mirrored() -> Snapshot:
+    """The hall with a mirror in it."""
+    snapshot = hall(0.2)
+    chrome = Material("chrome", metallic=Channel((1.0,)), roughness=Channel((0.1,)))
+    return dataclasses.replace(snapshot, materials=(*snapshot.materials[:-1], chrome))
+
+
+def made_by_command(snapshot: Snapshot, target: Path, *words: str) -> dict:
+    scene = stored(target, snapshot)
+    return succeed("bake", scene, "-o", target / "bake", *QUICK, *words)
+
+
+def test_the_command_makes_probes_where_surfaces_are_glossy(tmp_path, monkeypatch):
+    monkeypatch.setattr(cli.probe_job, "AUTOMATIC", probe_bytes(128, 1) * 1.5e-6)
+    said = made_by_command(mirrored(), tmp_path)
+    assert said["probes"]["count"] == 1
+    assert said["bytes"]["probes"] == (tmp_path / "bake/probes.exr").stat().st_size
+    assert "probes" in said["modelled"]
+    assert succeed("verify", tmp_path / "bake") == {"defects": []}
+    again = made_by_command(mirrored(), tmp_path)
+    assert again["probes"] == {"count": 1, "rays": 0.0, "noise": 0.0}
+    none = made_by_command(mirrored(), tmp_path, "--probes", "none")
+    assert "probes" not in none["modelled"]
+    assert {"what": "probes", "why": "none were asked for"} in none["left_out"]
+    assert not (tmp_path / "bake/probes.exr").exists()
+    assert succeed("verify", tmp_path / "bake") == {"defects": []}
+
+
+def test_the_command_says_why_a_dull_scene_has_none_and_makes_them_if_asked(tmp_path):
+    said = made_by_command(hall(0.2), tmp_path)
+    (why,) = [item["why"] for item in said["left_out"] if item["what"] == "probes"]
+    assert why.startswith("0.0 % of all surfaces are smoother than roughness 0.4; --probes N")
+    said = call("bake", tmp_path / "level.giv", "-o", tmp_path / "bake", *QUICK, "--probes", "1").out
+    assert re.search(r"^1 reflection probes, 0\.\d\d MB, \d+ rays a texel, noise \d+\.\d %$", said, re.MULTILINE)
+
+
+def test_some_cells_alone_have_no_probes_yet(tmp_path):
+    scene = stored(tmp_path, hall(4.2, 134.2))
+    words = ("bake", scene, "-o", tmp_path / "bake", *QUICK, "--probes", "1")
+    (why,) = [item["why"] for item in succeed(*words, "--cells", "0,0")["left_out"] if item["what"] == "probes"]
+    assert "of the scene's cells are not baked yet" in why
+    assert succeed(*words)["probes"]["count"] == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (("--probes", "many"), "whole number"),
+        (("--probes", "-1"), "whole number"),
+        (("--probe-megabytes", "0"), "number of megabytes above 0"),
+        (("--probe-megabytes", "nan"), "number of megabytes above 0"),
+    ],
+)
+def test_words_that_make_no_sense_are_wrong_usage(tmp_path, words, why):
+    said = call("bake", tmp_path / "scene.giv", "-o", tmp_path / "bake", *words)
+    assert said.code == 2
+    assert why in said.err
