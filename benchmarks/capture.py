@@ -28,7 +28,7 @@ from gi_volumes.bake.capture import Studio, shoot
 from gi_volumes.bake.gather import Effort
 from gi_volumes.bake.lamps import LUMINANCE
 from gi_volumes.bake.picture import panels
-from gi_volumes.bake.scene import Scene, prepare
+from gi_volumes.bake.scene import prepare
 from gi_volumes.bake.settings import Settings, choose_grid, model
 from gi_volumes.bake.sobol import Sampler, scramble
 from gi_volumes.benchmarks.results import add_row

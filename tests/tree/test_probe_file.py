@@ -6,10 +6,12 @@ import dataclasses
 import json
 
 import numpy as np
+import OpenEXR
 import pytest
-from gi_volumes.tree import exr, folder, probe_file
+from gi_volumes.tree import exr, folder, octahedral, probe_file
 from gi_volumes.tree.container import FileError
 from gi_volumes.tree.grid import Grid
+from gi_volumes.tree.probe_atlas import fetch
 from gi_volumes.tree.probe_maps import ProbeMaps, empty, part_names
 from gi_volumes.tree.verify import verify
 
@@ -203,3 +205,30 @@ def test_a_part_that_was_changed_shows(bake):
     changed = dataclasses.replace(maps, position=maps.position + 1)
     probe_file.write(place, changed, BAKE, "made")
     assert [defect.file for defect in verify(place)] == ["probes.exr"]
+
+
+def described_texel(direction, pitch: int, columns: int, probe: int) -> tuple[int, int]:
+    """Line and column of the texel that shows a direction, as section 7 of docs/format.md has it."""
+    x, y, z = direction
+    s = abs(x) + abs(y) + abs(z)
+    a, b = x / s, y / s
+    if z < 0:
+        a, b = (1 - abs(y / s)) * (1 if x >= 0 else -1), (1 - abs(x / s)) * (1 if y >= 0 else -1)
+    n = pitch - 2
+    line, column = (min(int((part + 1) / 2 * n), n - 1) for part in (b, a))
+    return probe // columns * pitch + 1 + line, probe % columns * pitch + 1 + column
+
+
+def test_the_format_s_library_and_the_description_find_what_look_ups_find(bake):
+    place, header = bake
+    entry, file = header["probes"], OpenEXR.File(str(place / "probes.exr"))
+    assert json.loads(file.parts[0].header["gi_volumes"]) == {k: v for k, v in entry.items() if k != "file"}
+    pixels = {part.name(): next(iter(part.channels.values())).pixels for part in file.parts}
+    maps, level = probe_file.load(place, header), 1
+    for probe in range(3):
+        directions = octahedral.centers(maps.layout.sizes[level]).reshape(-1, 3)
+        found = fetch(maps.radiance["sun.1"][level], maps.layout, level, np.full(len(directions), probe), directions)
+        texels = [described_texel(d, entry["pitch"] >> level, entry["columns"], probe) for d in directions]
+        assert found == pytest.approx(
+            np.array([pixels["sun.1.level_1"][texel] for texel in texels]), rel=1e-3, abs=1e-3
+        )
