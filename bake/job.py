@@ -17,9 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..tree import build, folder
+from ..tree import build, folder, probe_file
 from ..tree.grid import FIRST_SIZE, Grid
-from ..tree.probe_file import PROBES
 from ..tree.topology import Topology
 from . import changes, memory, probe_job, snapshot_file, summary
 from .cell_job import History, Work, bake_cell, list_of, look_early
@@ -319,8 +318,8 @@ def _make_probes(work: Work, wish: Wish | None, missing: int, progress: Progress
     if not why:
         progress.stage("Probes", STEPS)
         return probe_job.run(job, lambda share: progress.show(int(share * STEPS))), ""
-    if (target / PROBES).exists() and missing == 0:
-        (target / PROBES).unlink()
+    if missing == 0 and probe_file.describe(target) is not None:
+        (target / probe_file.PROBES).unlink()
         folder.list_again(target)
     return Made(0, 0), why
 
