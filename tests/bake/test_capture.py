@@ -391,6 +391,14 @@ def test_no_probes_are_no_work():
     assert np.isinf(studio.maps.distance).all()
 
 
+def test_without_light_probes_still_see_surfaces():
+    room = build_scenes.box((0, 0, 0), (4, 3, 2.5), inward=True)
+    studio = taken(prepare(build_scenes.snapshot([(room, matte(0.5))]), Model()), (1, 1, 1))
+    assert studio.maps.radiance == {}
+    assert map_of(studio, studio.maps.albedo) == pytest.approx(0.5)
+    assert map_of(studio, studio.maps.distance).min() == pytest.approx(1, rel=0.01)
+
+
 def test_progress_counts_probes_and_stops_the_work():
     said = []
     taken(furnished(), PLACE, PLACE, pitch=16, progress=lambda done: said.append(done) or True)
