@@ -7,6 +7,7 @@ at all. Surface caches are those of cells: around a cell, or one for a scene tha
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 from collections.abc import Callable, Iterator
@@ -24,6 +25,7 @@ from . import radiosity
 from .capture import FIRST_RAYS, HALVES, Spending, Studio, shoot
 from .gather import Effort
 from .glossiness import ROUGH, glossy_share
+from .lit_patches import are_lit
 from .patches import Forest
 from .probes import LEAST_GAIN, Request, place
 from .scene import Scene
@@ -244,7 +246,8 @@ def _request(job: Job) -> Request:
     """The wish in the terms of placement."""
     wish, size = job.wish, probe_bytes(job.wish.spending.pitch, len(job.parts))
     pinned, deleted = (np.asarray(part, np.float64) - job.scene.origin for part in (wish.pinned, wish.deleted))
-    return Request(wish.count, wish.megabytes, size, wish.least_gain, pinned, deleted)
+    counts = functools.partial(are_lit, job.scene, job.effort) if job.parts else None
+    return Request(wish.count, wish.megabytes, size, wish.least_gain, pinned, deleted, counts)
 
 
 def _shoot_all(job: Job, studio: Studio, trees: tuple[Topology, ...], show: Callable[[float], bool]) -> None:

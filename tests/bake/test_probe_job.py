@@ -16,10 +16,12 @@ from gi_volumes.bake import cli, probe_job, radiosity
 from gi_volumes.bake.capture import Spending
 from gi_volumes.bake.gather import Effort
 from gi_volumes.bake.job import Manner, bake
+from gi_volumes.bake.lit_patches import are_lit
 from gi_volumes.bake.parallel import CancelledError
+from gi_volumes.bake.patches import Patches
 from gi_volumes.bake.probe_job import Job, Made, Wish, probe_bytes, run
 from gi_volumes.bake.probes import RequestError
-from gi_volumes.bake.scene import prepare
+from gi_volumes.bake.scene import Model, prepare
 from gi_volumes.bake.settings import Settings, model
 from gi_volumes.bake.snapshot import Channel, Material, Snapshot
 from gi_volumes.tree import folder, probe_file
@@ -182,6 +184,36 @@ def test_the_same_bake_again_keeps_its_probes(target):
     assert bytes_in(target) == before
 
 
+def test_a_closed_dark_room_gets_no_probe(tmp_path, monkeypatch):
+    snapshot = hall(0.2)
+    cellar = build_scenes.box((14, 0.5, 0.1), (24, 8.5, 4.1), inward=True)
+    lights, wall = snapshot.lights, Material("wall", Channel((0.7, 0.6, 0.5)))
+    hall_walls = snapshot.geometry.positions.reshape(-1, 3, 3)
+    snapshot = build_scenes.snapshot([(hall_walls, wall), (cellar, wall)], lights, origin=ORIGIN)
+    bake(snapshot, tmp_path, SETTINGS)
+    run(job_of(tmp_path, snapshot, wish=Wish(6, spending=SPENDING)))
+    maps = probe_file.load(tmp_path, folder.load_header(tmp_path))
+    assert len(maps.position) == 6
+    assert not ((maps.position > at(14, 0.5, 0.1)) & (maps.position < at(24, 8.5, 4.1))).all(axis=1).any()
+    monkeypatch.setattr(probe_job, "are_lit", lambda scene, effort, seen: np.ones(len(seen.weight), bool))
+    run(job_of(tmp_path, snapshot, wish=Wish(5, spending=SPENDING)))
+    maps = probe_file.load(tmp_path, folder.load_header(tmp_path))
+    assert ((maps.position > at(14, 0.5, 0.1)) & (maps.position < at(24, 8.5, 4.1))).all(axis=1).any()
+
+
+def test_patches_that_no_light_arrives_at_do_not_count_unless_it_arrives_nowhere():
+    boxes = (0, 0, 0), (4, 4, 4), (6, 0, 0), (10, 4, 4)
+    walls = [build_scenes.box(*boxes[:2], inward=True), build_scenes.box(*boxes[2:], inward=True)]
+    material = Material("wall")
+    start = np.float32([[1, 3, 7, 9], [1, 2, 1, 2], [0.001] * 4])
+    patches = Patches(start, np.float32([[0] * 4, [0] * 4, [1] * 4]), np.ones(4, np.float32), np.ones(4, np.float32))
+    for strength, lit in ((1.0, [True, True, False, False]), (0.0, [True] * 4)):
+        lights = build_scenes.lamps({"position": (2, 2, 3), "strength": (strength,) * 3})
+        snapshot = build_scenes.snapshot([(np.concatenate(walls), material)], lights, sky=(0, 0, strength))
+        scene = prepare(snapshot, Model(sky="fixed"))
+        assert are_lit(scene, Effort(0), patches).tolist() == lit
+
+
 def test_a_large_scene_has_a_cache_for_each_cell(tmp_path, monkeypatch):
     snapshot, boxes = hall(4.2, 134.2), []
     bake(snapshot, tmp_path, SETTINGS)
@@ -254,3 +286,15 @@ def test_words_that_make_no_sense_are_wrong_usage(tmp_path, words, why):
     said = call("bake", tmp_path / "scene.giv", "-o", tmp_path / "bake", *words)
     assert said.code == 2
     assert why in said.err
+
+
+def test_probes_of_a_scene_without_light_are_made_if_asked(tmp_path):
+    snapshot = dataclasses.replace(hall(0.2), lights=build_scenes.lamps())
+    settings = dataclasses.replace(SETTINGS, sky="0")
+    bake(snapshot, tmp_path, settings)
+    job = job_of(tmp_path, dataclasses.replace(snapshot, sky=snapshot.sky * 0))
+    scene = prepare(snapshot, Model())
+    job = dataclasses.replace(job, scene=scene, mixture=np.zeros((0, 3)))
+    assert run(job).count == 3
+    assert probe_job.why_none(job) == "there is no light to reflect"
+    assert verify(tmp_path) == []
