@@ -292,9 +292,7 @@ def test_probes_of_a_scene_without_light_are_made_if_asked(tmp_path):
     snapshot = dataclasses.replace(hall(0.2), lights=build_scenes.lamps())
     settings = dataclasses.replace(SETTINGS, sky="0")
     bake(snapshot, tmp_path, settings)
-    job = job_of(tmp_path, dataclasses.replace(snapshot, sky=snapshot.sky * 0))
-    scene = prepare(snapshot, Model())
-    job = dataclasses.replace(job, scene=scene, mixture=np.zeros((0, 3)))
+    job = job_of(tmp_path, snapshot, scene=prepare(snapshot, Model()), mixture=np.zeros((0, 3)))
     assert run(job).count == 3
     assert probe_job.why_none(job) == "there is no light to reflect"
     assert verify(tmp_path) == []
