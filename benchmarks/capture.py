@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import os
 import tempfile
 import time
@@ -27,6 +28,7 @@ from gi_volumes.bake import job, patches, paths, probe_job, probes, radiosity, s
 from gi_volumes.bake.capture import Studio, shoot
 from gi_volumes.bake.gather import Effort
 from gi_volumes.bake.lamps import LUMINANCE
+from gi_volumes.bake.lit_patches import are_lit
 from gi_volumes.bake.picture import panels
 from gi_volumes.bake.scene import prepare
 from gi_volumes.bake.settings import Settings, choose_grid, model
@@ -78,7 +80,8 @@ class Bench:
         """(k, 3) where probes stand."""
         corners = self.scene.soup.corners
         trees = tuple(build(corners, grid, tuple(cell)) for cell in occupied_cells(corners, grid))
-        return probes.place(self.scene, patches.Forest(grid, trees), probes.Request(count), self.effort).position
+        request = probes.Request(count, counts=functools.partial(are_lit, self.scene, self.effort))
+        return probes.place(self.scene, patches.Forest(grid, trees), request, self.effort).position
 
     def studio(self, place: np.ndarray, threads: int) -> Studio:
         """Make room for some probes.
