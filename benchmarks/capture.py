@@ -6,9 +6,9 @@
 Probes are placed and captured as a bake of these settings does it, by the surface cache. `rays_per_s` is what one
 thread meets in a second of processor time, `embreex_per_s` the same rays with nothing around them. `noise` is what
 probes say of themselves; `error` compares texels of the sharpest level with plain path tracing without a cache, 256
-rays through each of 1,000 texels of every probe, whose own noise is taken off: root mean square, over the light there plus the map's
-mean. `energy` is the mean of these texels over that of the tracing. Pictures show all directions, upwards is above: as
-captured, path traced, and the difference.
+rays through each of 1,000 texels of every probe, whose own noise is taken off: root mean square, over the light there
+plus the map's mean. `energy` is the mean of these texels over that of the tracing. Pictures show all directions,
+upwards is above: as captured, path traced, and the difference.
 """
 
 from __future__ import annotations
