@@ -88,7 +88,7 @@ class Job:
     mixture : (parts, 3) float64, as in `capture.Studio`
     wish : Wish
     effort : Effort, bounces, seed, threads
-    cached : bool, whether paths end in surface caches
+    cached : bool, whether paths end in surface caches, where the bake's checks have found nothing wrong with them
     """
 
     scene: Scene
@@ -238,7 +238,7 @@ def _digest(job: Job, trees: tuple[Topology, ...]) -> str:
     wish, effort = job.wish, job.effort
     asked = [wish.count, wish.megabytes, wish.least_gain, wish.spending.error, wish.spending.most, wish.spending.pitch]
     asked += [np.asarray(wish.pinned, np.float64).tolist(), np.asarray(wish.deleted, np.float64).tolist()]
-    done = [effort.bounces, effort.seed, job.cached, [tree.cell for tree in trees]]
+    done = [effort.bounces, effort.seed, [tree.cell for tree in trees]]
     return hashlib.blake2b(json.dumps([FORMAT, asked, done]).encode(), digest_size=16).hexdigest()
 
 

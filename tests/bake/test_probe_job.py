@@ -12,7 +12,7 @@ import build_scenes
 import numpy as np
 import pytest
 from command_line import QUICK, call, stored, succeed
-from gi_volumes.bake import cli, probe_job, radiosity
+from gi_volumes.bake import cell_job, cli, probe_job, radiosity
 from gi_volumes.bake.capture import Spending
 from gi_volumes.bake.gather import Effort
 from gi_volumes.bake.job import Manner, bake
@@ -286,6 +286,17 @@ def test_words_that_make_no_sense_are_wrong_usage(tmp_path, words, why):
     said = call("bake", tmp_path / "scene.giv", "-o", tmp_path / "bake", *words)
     assert said.code == 2
     assert why in said.err
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_surface_caches_that_a_bake_finds_to_be_off_are_not_used_for_probes(tmp_path, monkeypatch, fails):
+    jobs = []
+    monkeypatch.setattr(cell_job, "WORTH", 0)
+    monkeypatch.setattr(cell_job.Check, "fails", lambda check, error: fails)
+    monkeypatch.setattr(probe_job, "run", lambda job, show: jobs.append(job) or Made(0, 0))
+    settings = dataclasses.replace(SETTINGS, method="cache")
+    bake(hall(0.2), tmp_path, settings, manner=Manner(threads=1, probes=Wish(1, spending=SPENDING)))
+    assert [job.cached for job in jobs] == [not fails]
 
 
 def test_probes_of_a_scene_without_light_are_made_if_asked(tmp_path):
