@@ -43,8 +43,8 @@ WORTH = 1 << 20
 """Rays of a cell's probes below which paths are followed to their end: a surface cache takes as long."""
 
 AUTOMATIC = 32.0
-"""Most that maps take where nobody says otherwise [MB]: 51 probes of a lamp, a sun and a sky. They take about as long
-as the cells, and show two thirds of what ever so many would (`docs/accuracy.md`, *Reflection probes*)."""
+"""Most that maps take where nobody says otherwise [MB]: 51 probes with parts for lamps, a sun and a sky, which are
+captured in about the time that the cells take."""
 
 LEAST_GLOSSY = 0.01
 """Part of the surfaces that has to be glossy for probes to be made where nobody asks for them."""
