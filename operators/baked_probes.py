@@ -15,7 +15,6 @@ import numpy as np
 
 # Pairs of places whose distances are worked out at once: 25 MB.
 PAIRS = 1 << 20
-MEGABYTE = 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,16 +25,16 @@ class Baked:
     reach : (k,) float64 [m], half the distance to the nearest other one; of a single one half a first-level voxel
     pinned : (k,) bool
     made : str, hash of what they were made of; empty without any
-    megabytes : what they take as textures [MB]
-    file_megabytes : length of their file [MB]
+    texture_bytes : what they take as textures
+    file_bytes : length of their file
     """
 
     place: np.ndarray
     reach: np.ndarray
     pinned: np.ndarray
     made: str
-    megabytes: float
-    file_megabytes: float
+    texture_bytes: int
+    file_bytes: int
 
 
 def read(folder: Path) -> Baked | None:
@@ -112,5 +111,5 @@ def _of(listed: dict, alone: float, probe_bytes: Callable[[int, int], int]) -> B
     """What an entry of `world.json` says; `probe_bytes` knows what a probe of a pitch and parts takes."""
     place = np.array(listed["positions"], np.float64).reshape(-1, 3)
     each = probe_bytes(listed["pitch"], len(listed["parts"])) if len(place) else 0
-    sizes = len(place) * each / MEGABYTE, listed["file"]["bytes"] / MEGABYTE
-    return Baked(place, reaches(place, alone), np.array(listed["pinned"], bool), listed["made"], *sizes)
+    pinned, file_bytes = np.array(listed["pinned"], bool), listed["file"]["bytes"]
+    return Baked(place, reaches(place, alone), pinned, listed["made"], len(place) * each, file_bytes)

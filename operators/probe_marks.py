@@ -7,6 +7,8 @@ object stands for it any more. Hidden ones count like others.
 
 from __future__ import annotations
 
+import math
+
 import bpy
 import numpy as np
 
@@ -62,11 +64,12 @@ class Marks:
         ProbeEdits
             Each place once, sorted.
         """
-        for object in probes_of(scene):
+        found = probes_of(scene)
+        for object in found:
             if object.as_pointer() not in self._met:
                 self.add(object, _resting(object), object.name)
         pinned = np.unique(np.array(self._pinned, np.float64).reshape(-1, 3), axis=0)
-        return ProbeEdits(pinned, boxes(deleted(scene)))
+        return ProbeEdits(pinned, boxes(deleted(scene, found)))
 
 
 def is_probe(object: bpy.types.Object) -> bool:
@@ -118,8 +121,7 @@ def is_pinned(object: bpy.types.Object, place: np.ndarray) -> bool:
         Whether it was pinned, or is not where the bake had put it.
     """
     settings = object.original.gi_volumes
-    off = np.linalg.norm(place - np.array(settings.placed, np.float64))
-    return settings.kept or bool(off > STILL * settings.reach)
+    return settings.kept or math.dist(place, settings.placed) > STILL * settings.reach
 
 
 def place_of(object: bpy.types.Object) -> np.ndarray:
@@ -159,13 +161,15 @@ def release(object: bpy.types.Object) -> None:
         object.matrix_world = matrix
 
 
-def deleted(scene: bpy.types.Scene) -> list[tuple[tuple[float, ...], float]]:
+def deleted(scene: bpy.types.Scene, found: list[bpy.types.Object]) -> list[tuple[tuple[float, ...], float]]:
     """List places where an artist wants no probe.
 
     Parameters
     ----------
     scene : bpy.types.Scene
         The scene.
+    found : list of bpy.types.Object
+        Its probes, as from `probes_of`.
 
     Returns
     -------
@@ -176,23 +180,24 @@ def deleted(scene: bpy.types.Scene) -> list[tuple[tuple[float, ...], float]]:
     settings = getattr(scene, "gi_volumes", None)
     if settings is None:
         return []
-    return [(tuple(item.place), item.reach) for item in (*settings.deleted_probes, *missing(scene))]
+    return [(tuple(item.place), item.reach) for item in (*settings.deleted_probes, *missing(scene, found))]
 
 
-def missing(scene: bpy.types.Scene) -> list[bpy.types.PropertyGroup]:
+def missing(scene: bpy.types.Scene, found: list[bpy.types.Object]) -> list[bpy.types.PropertyGroup]:
     """List places of probes that were shown and that no object stands for any more.
 
     Parameters
     ----------
     scene : bpy.types.Scene
         The scene.
+    found : list of bpy.types.Object
+        Its probes, as from `probes_of`.
 
     Returns
     -------
     list of GIVOLUMES_PG_place
         None where no probe is left at all: somebody has put the whole collection away.
     """
-    found = probes_of(scene)
     homes = {tuple(object.gi_volumes.placed) for object in found}
     return [item for item in scene.gi_volumes.placed_probes if found and tuple(item.place) not in homes]
 

@@ -30,13 +30,12 @@ def show(scene: bpy.types.Scene, baked: Baked) -> None:
         The probes of its bake.
     """
     settings, old = scene.gi_volumes, probe_marks.probes_of(scene)
-    _remember(settings.deleted_probes, probe_marks.missing(scene))
+    _remember(settings.deleted_probes, probe_marks.missing(scene, old))
     pinned = [object for object in old if probe_marks.is_pinned(object, probe_marks.place_of(object))]
     if baked.made != settings.shown_probes:
         for object in pinned:
             _keep(object)
-    wanted = _wanted(baked, probe_marks.boxes(probe_marks.deleted(scene)))
-    _note(settings.placed_probes, wanted)
+    wanted = _wanted(baked, probe_marks.boxes(probe_marks.deleted(scene, old)))
     settings.shown_probes = baked.made
     for object in pinned:
         wanted.pop(tuple(object.gi_volumes.placed), None)
@@ -47,6 +46,8 @@ def show(scene: bpy.types.Scene, baked: Baked) -> None:
     if not old:
         for place, reach in zip(baked.place[baked.pinned], baked.reach[baked.pinned], strict=True):
             add(scene, tuple(place), float(reach)).gi_volumes.kept = True
+    shown = [object.gi_volumes for object in probe_marks.probes_of(scene)]
+    _note(settings.placed_probes, {tuple(probe.placed): probe.reach for probe in shown})
 
 
 def add(scene: bpy.types.Scene, place: tuple[float, ...], reach: float) -> bpy.types.Object:
@@ -105,12 +106,13 @@ def forget_deleted(scene: bpy.types.Scene) -> int:
     int
         How many places there were.
     """
-    settings, gone = scene.gi_volumes, probe_marks.deleted(scene)
-    lost = {tuple(item.place) for item in probe_marks.missing(scene)}
+    settings, found = scene.gi_volumes, probe_marks.probes_of(scene)
+    count = len(probe_marks.deleted(scene, found))
+    lost = {tuple(item.place) for item in probe_marks.missing(scene, found)}
     left = {tuple(item.place): item.reach for item in settings.placed_probes if tuple(item.place) not in lost}
     _note(settings.placed_probes, left)
     settings.deleted_probes.clear()
-    return len(gone)
+    return count
 
 
 def _remember(places, items) -> None:

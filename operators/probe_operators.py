@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from . import baked_probes, dependencies, probe_marks, probe_objects, properties
+from . import baked_probes, dependencies, job, probe_marks, probe_objects, properties
 from .snapshot_command import one_line
 
 # Modal operators that would be left with objects that are gone.
@@ -30,7 +30,7 @@ class GIVOLUMES_OT_place_probes(bpy.types.Operator):
             return {"CANCELLED"}
         probe_objects.show(context.scene, baked)
         if len(baked.place):
-            self.report({"INFO"}, f"{len(baked.place)} reflection probes, {baked.megabytes:.1f} MB as textures")
+            self.report({"INFO"}, f"{len(baked.place)} reflection probes, {job.size(baked.texture_bytes)} as textures")
         else:
             self.report({"WARNING"}, "This bake has no reflection probes: its summary says why; see also Probes")
         return {"FINISHED"}
@@ -92,15 +92,12 @@ class GIVOLUMES_OT_forget_deleted_probes(bpy.types.Operator):
     bl_label = "Allow Deleted Again"
     bl_options = {"REGISTER", "UNDO"}
 
-    @classmethod
-    def poll(cls, context):
-        found = bool(probe_marks.deleted(context.scene))
-        if not found:
-            cls.poll_message_set("No reflection probe has been deleted")
-        return found
-
     def execute(self, context):
-        self.report({"INFO"}, f"Probes are allowed again at {probe_objects.forget_deleted(context.scene)} places")
+        count = probe_objects.forget_deleted(context.scene)
+        if not count:
+            self.report({"WARNING"}, "No reflection probe has been deleted")
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"Probes are allowed again at {count} places")
         return {"FINISHED"}
 
 

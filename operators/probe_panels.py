@@ -30,10 +30,11 @@ class _Probes:
         row = layout.row(align=True)
         row.operator("gi_volumes.pin_probes", icon="PINNED").pin = True
         row.operator("gi_volumes.pin_probes", text="Release", icon="UNPINNED").pin = False
+        found = probe_marks.probes_of(context.scene)
         column = layout.column(align=True)
-        for line in status(context.scene):
+        for line in status(context.scene, found):
             column.label(text=line)
-        if probe_marks.deleted(context.scene):
+        if probe_marks.deleted(context.scene, found):
             layout.operator("gi_volumes.forget_deleted_probes", icon="LOOP_BACK")
 
 
@@ -69,25 +70,27 @@ class GIVOLUMES_PT_object(bpy.types.Panel):
 
     def draw(self, context):
         self.layout.use_property_split = True
+        self.layout.use_property_decorate = False
         self.layout.prop(context.object.gi_volumes, "pinned")
 
 
-def status(scene: bpy.types.Scene) -> list[str]:
+def status(scene: bpy.types.Scene, found: list[bpy.types.Object]) -> list[str]:
     """Say what there is of reflection probes.
 
     Parameters
     ----------
     scene : bpy.types.Scene
         The scene.
+    found : list of bpy.types.Object
+        Its probes' objects.
 
     Returns
     -------
     list of str
         A line about the bake's, where there is a bake; a line about what the next one is told.
     """
-    found = probe_marks.probes_of(scene)
     pinned = sum(probe_marks.is_pinned(object, probe_marks.place_of(object)) for object in found)
-    gone = len(probe_marks.deleted(scene))
+    gone = len(probe_marks.deleted(scene, found))
     lines = [_baked(scene)] if not dependencies.complaint() else []
     return [*filter(None, lines), f"Next bake: {pinned} pinned, {gone} deleted"]
 
@@ -102,7 +105,7 @@ def _baked(scene: bpy.types.Scene) -> str:
         return ""
     if not len(baked.place):
         return "The bake has none"
-    return f"The bake has {len(baked.place)}: {baked.megabytes:.1f} MB, file {baked.file_megabytes:.1f} MB"
+    return f"The bake has {len(baked.place)}: {job.size(baked.texture_bytes)}, file {job.size(baked.file_bytes)}"
 
 
 CLASSES = (GIVOLUMES_PT_render_probes, GIVOLUMES_PT_sidebar_probes, GIVOLUMES_PT_object)

@@ -49,6 +49,7 @@ class GIVOLUMES_PG_object(bpy.types.PropertyGroup):
         name="Pinned",
         description="The next bake makes a probe here in any case. Probes that were moved, added or duplicated are"
         " pinned; without this the probe goes back to where the bake had put it",
+        options=set(),  # not to be animated
         get=_is_pinned,
         set=_pin,
     )

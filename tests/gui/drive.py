@@ -43,7 +43,7 @@ def start(quality: str, output: str):
 
 
 def open_panel(name: str) -> None:
-    """Draw a panel that is closed by default."""
+    """Make a panel that is closed by default an open one, before it is drawn for the first time."""
     panel = getattr(bpy.types, name)
     bpy.utils.unregister_class(panel)
     panel.bl_options = set()
@@ -80,12 +80,11 @@ def probes(where: dict):
     room.scale = (4.0, 4.0, 4.0)
     room.data.flip_normals()
     bpy.context.scene.gi_volumes.probes, bpy.context.scene.gi_volumes.probe_count = "count", 2
-    open_panel("GIVOLUMES_PT_sidebar_probes")
     running = start("draft", "finished")
     yield from until(lambda: job().current is None, running)
     with bpy.context.temp_override(**where):
         assert bpy.ops.gi_volumes.place_probes("INVOKE_DEFAULT") == {"FINISHED"}
-    moved, other = bpy.data.collections["GI Probes"].objects
+    moved = bpy.data.collections["GI Probes"].objects[0]
     moved.select_set(True)
     bpy.context.view_layer.objects.active = moved
     moved.location = (3.0, 3.0, 3.0)
@@ -104,6 +103,7 @@ def probes(where: dict):
 def scenario():
     """Everything that an artist does, one `yield` per timer tick."""
     bpy.ops.extensions.package_install_files(filepath=str(ARCHIVE), repo=REPOSITORY, enable_on_install=True)
+    open_panel("GIVOLUMES_PT_sidebar_probes")
     where = view()
     where["area"].spaces.active.show_region_ui = True
     yield

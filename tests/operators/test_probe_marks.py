@@ -42,7 +42,7 @@ def show(studio, settings):
         places = np.asarray(places, float).reshape(-1, 3)
         reach = baked_probes.reaches(places, 4.0)
         is_pinned = np.isin(np.arange(len(places)), pinned)
-        probe_objects.show(studio.scene, baked_probes.Baked(places, reach, is_pinned, made, 1.0, 1.0))
+        probe_objects.show(studio.scene, baked_probes.Baked(places, reach, is_pinned, made, 1, 1))
         return probe_marks.probes_of(studio.scene)
 
     return run
@@ -207,6 +207,20 @@ def test_showing_the_same_bake_again_changes_nothing(studio, show, extract):
         assert (again.pinned.tolist(), again.deleted.tolist()) == (said.pinned.tolist(), said.deleted.tolist())
 
 
+def test_a_pinned_probe_that_is_deleted_keeps_others_away_once_it_was_shown(studio, show, extract):
+    from gi_volumes.operators import probe_objects
+
+    added = [probe_objects.add(studio.scene, place, 1.0) for place in ((9, 9, 9), (7, 7, 7))]
+    for object in added:
+        object.gi_volumes.kept = True
+    studio.bpy.data.objects.remove(added[1])
+    assert len(extract().probes.deleted) == 0
+    show()
+    studio.bpy.data.objects.remove(added[0])
+    assert extract().probes.deleted == pytest.approx(np.array([[[8, 8, 8], [10, 10, 10]]]))
+    assert len(extract().probes.pinned) == 0
+
+
 def test_pinned_probes_of_a_bake_are_shown_in_a_file_that_has_none(show, extract):
     assert [object.gi_volumes.pinned for object in show(pinned=[3])] == [False, False, False, True]
     assert extract().probes.pinned == pytest.approx(PLACES[3:])
@@ -219,7 +233,7 @@ def test_deleted_places_can_be_allowed_again(studio, marks, show, extract):
     studio.bpy.data.objects.remove(probes[2])
     show()
     studio.bpy.data.objects.remove(probes[3])
-    assert len(extract().probes.deleted) == len(marks.deleted(studio.scene)) == 2
+    assert len(extract().probes.deleted) == len(marks.deleted(studio.scene, probes[:2])) == 2
     assert probe_objects.forget_deleted(studio.scene) == 2
     assert len(extract().probes.deleted) == 0
     assert len(show()) == 4
