@@ -306,9 +306,8 @@ def _make_probes(work: Work, wish: Wish | None, missing: int, progress: Progress
     """Reflection probes, or why there are none; older ones go then."""
     settings, target = work.settings, work.place.target
     effort = Effort(0, settings.bounces, settings.seed, work.target.effort.threads)
-    job = probe_job.Job(
-        work.scene, work.grid, target, work.judge.mean, wish or Wish(), effort, settings.method == "cache"
-    )
+    trusted = settings.method == "cache" and not any(work.fails(check) for check in work.checks.values())
+    job = probe_job.Job(work.scene, work.grid, target, work.judge.mean, wish or Wish(), effort, trusted)
     if wish is None:
         why = "none were asked for"
     elif missing:

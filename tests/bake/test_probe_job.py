@@ -12,7 +12,7 @@ import build_scenes
 import numpy as np
 import pytest
 from command_line import QUICK, call, stored, succeed
-from gi_volumes.bake import cli, probe_job, radiosity
+from gi_volumes.bake import cell_job, cli, probe_job, radiosity
 from gi_volumes.bake.capture import Spending
 from gi_volumes.bake.gather import Effort
 from gi_volumes.bake.job import Manner, bake
@@ -112,7 +112,8 @@ def test_a_damaged_file_is_made_again(target):
     assert bytes_in(target) == before
 
 
-def test_any_number_of_threads_gives_the_same_file(target):
+def test_any_number_of_threads_gives_the_same_file(target, monkeypatch):
+    monkeypatch.setattr(probe_job, "WORTH", 0)
     files = []
     for threads in (1, 2, 3):
         job = job_of(target, hall(0.2), effort=Effort(0, SETTINGS.bounces, 0, threads), cached=True)
@@ -130,7 +131,8 @@ def test_work_that_is_stopped_leaves_the_folder_as_it_was(target, share):
     assert bytes_in(target) == before
 
 
-def test_progress_rises_from_begin_to_end(target):
+def test_progress_rises_from_begin_to_end(target, monkeypatch):
+    monkeypatch.setattr(probe_job, "WORTH", 0)
     said = []
     run(job_of(target, hall(0.2), cached=True), lambda share: said.append(share) or True)
     assert said == sorted(said)
@@ -221,7 +223,7 @@ def test_a_large_scene_has_a_cache_for_each_cell(tmp_path, monkeypatch):
     around = radiosity.around
     monkeypatch.setattr(radiosity, "around", lambda *a: boxes.append(a[2]) or around(*a))
     outside = at(300, 0, 1)
-    run(job_of(tmp_path, snapshot, cached=True, wish=Wish(5, spending=SPENDING, pinned=outside[None])))
+    run(job_of(tmp_path, snapshot, cached=True, wish=Wish(7, spending=SPENDING, pinned=outside[None])))
     maps = probe_file.load(tmp_path, folder.load_header(tmp_path))
     cells = np.unique(np.floor((maps.position[1:, 0] - ORIGIN[0]) / 128))
     assert cells.tolist() == [0, 1]
@@ -318,6 +320,26 @@ def test_words_that_make_no_sense_are_wrong_usage(tmp_path, words, why):
     said = call("bake", tmp_path / "scene.giv", "-o", tmp_path / "bake", *words)
     assert said.code == 2
     assert why in said.err
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_surface_caches_that_a_bake_finds_to_be_off_are_not_used_for_probes(tmp_path, monkeypatch, fails):
+    jobs = []
+    monkeypatch.setattr(cell_job, "WORTH", 0)
+    monkeypatch.setattr(cell_job.Check, "fails", lambda check, error: fails)
+    monkeypatch.setattr(probe_job, "run", lambda job, show: jobs.append(job) or Made(0, 0))
+    settings = dataclasses.replace(SETTINGS, method="cache")
+    bake(hall(0.2), tmp_path, settings, manner=Manner(threads=1, probes=Wish(1, spending=SPENDING)))
+    assert [job.cached for job in jobs] == [not fails]
+
+
+@pytest.mark.parametrize(("worth", "caches"), [(2 * 8 * 14 * 14, 1), (2 * 8 * 14 * 14 + 1, 0)])
+def test_a_surface_cache_is_made_for_as_many_rays_as_are_worth_it(target, monkeypatch, worth, caches):
+    made, around = [], radiosity.around
+    monkeypatch.setattr(probe_job, "WORTH", worth)
+    monkeypatch.setattr(radiosity, "around", lambda *a: made.append(a[2]) or around(*a))
+    run(job_of(target, hall(0.2), cached=True))  # three probes of eight rays a texel
+    assert len(made) == caches
 
 
 def test_probes_of_a_scene_without_light_are_made_if_asked(tmp_path):
