@@ -14,6 +14,7 @@ import pytest
 from command_line import QUICK, call, stored, succeed
 from gi_volumes.bake import cell_job, cli, probe_job, radiosity
 from gi_volumes.bake.capture import Spending
+from gi_volumes.bake.changes import causes
 from gi_volumes.bake.gather import Effort
 from gi_volumes.bake.job import Manner, bake
 from gi_volumes.bake.lit_patches import are_lit
@@ -24,6 +25,7 @@ from gi_volumes.bake.probes import RequestError
 from gi_volumes.bake.scene import Model, prepare
 from gi_volumes.bake.settings import Settings, model
 from gi_volumes.bake.snapshot import Channel, Material, ProbeEdits, Snapshot
+from gi_volumes.bake.survey import Judge
 from gi_volumes.tree import folder, probe_file
 from gi_volumes.tree.verify import verify
 
@@ -291,6 +293,15 @@ def test_what_an_artist_says_makes_probes_anew_and_keeps_the_cells_to_the_last_b
     assert succeed("verify", tmp_path / "bake") == {"defects": []}
     made_by_command(hall(0.2), tmp_path, *words)
     assert bytes_in(tmp_path / "bake") == first
+
+
+def test_what_an_artist_says_changes_nothing_that_light_depends_on():
+    judge = Judge(np.ones((1, 2, 3)), np.ones((2, 3)))
+    found = []
+    for snapshot in (hall(0.2), said_by(hall(0.2), at(8, 4, 2), deleted=(at(0, 0, 0), at(5, 9, 9)))):
+        effective, light = model(snapshot, SETTINGS)
+        found.append(causes(effective, prepare(effective, light), judge))
+    assert found[0] == found[1]
 
 
 def test_a_dull_scene_gets_its_pinned_probes_and_no_others(tmp_path):
