@@ -41,7 +41,7 @@ def matte(albedo=0.0, emission=0.0, **other) -> Material:
     return Material("matte", base, shine, specular_level=0.0, **other)
 
 
-def taken(scene: Scene, *places, error=0.0, most=8, pitch=32, bounces=0, seed=0, threads=1, **other) -> Studio:
+def taken(scene: Scene, *places, error=0.0, most=16, pitch=32, bounces=0, seed=0, threads=1, **other) -> Studio:
     parts = int(scene.has_local) + len(scene.model.suns.toward) + scene.model.sky_count
     spending, effort = Spending(error, most, pitch), Effort(0, bounces, seed, threads)
     return capture(scene, np.array(places, float).reshape(-1, 3), np.ones((parts, 3)), spending, effort, **other)
@@ -354,8 +354,8 @@ def test_noise_is_what_it_is_said_to_be():
 
 def test_rays_go_on_until_the_noise_is_small_enough_or_there_are_too_many():
     noisy, quiet = PLACE, (100.0, 100.0, 100.0)
-    studio = taken(furnished(), noisy, quiet, error=0.03, most=4096, bounces=BOUNCES, pitch=16)
-    assert (studio.noise <= 0.03).all()
+    studio = taken(furnished(), noisy, quiet, error=0.02, most=4096, bounces=BOUNCES, pitch=16)
+    assert (studio.noise <= 0.02).all()
     assert studio.rays[0] > studio.rays[1] == module.HALVES * module.FIRST_RAYS
     assert taken(furnished(), noisy, error=0.01, most=40, bounces=1, pitch=16).rays.tolist() == [32]
 

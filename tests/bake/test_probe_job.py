@@ -30,7 +30,7 @@ from gi_volumes.tree import folder, probe_file
 from gi_volumes.tree.verify import verify
 
 SETTINGS = Settings(samples=2, bounces=3, error=0.0, finest=2.0, sky="0.5,0.6,0.9")
-SPENDING = Spending(error=0.5, most=8, pitch=16)
+SPENDING = Spending(error=0.5, most=16, pitch=16)
 ORIGIN = np.array([1024.0, -2048.0, 0.0])
 
 
@@ -82,7 +82,7 @@ def test_probes_are_placed_captured_listed_and_found_sound(target):
     assert inside.all()
     assert made.bytes == (target / "probes.exr").stat().st_size
     assert made.noise <= 0.5
-    assert made.rays == 8
+    assert made.rays == 16
     assert maps.radiance["local"][0].astype(float).mean() > 0.05
     assert verify(target) == []
 
@@ -344,12 +344,12 @@ def test_surface_caches_that_a_bake_finds_to_be_off_are_not_used_for_probes(tmp_
     assert [job.cached for job in jobs] == [not fails]
 
 
-@pytest.mark.parametrize(("worth", "caches"), [(2 * 8 * 14 * 14, 1), (2 * 8 * 14 * 14 + 1, 0)])
+@pytest.mark.parametrize(("worth", "caches"), [(2 * 16 * 14 * 14, 1), (2 * 16 * 14 * 14 + 1, 0)])
 def test_a_surface_cache_is_made_for_as_many_rays_as_are_worth_it(target, monkeypatch, worth, caches):
     made, around = [], radiosity.around
     monkeypatch.setattr(probe_job, "WORTH", worth)
     monkeypatch.setattr(radiosity, "around", lambda *a: made.append(a[2]) or around(*a))
-    run(job_of(target, hall(0.2), cached=True))  # three probes of eight rays a texel
+    run(job_of(target, hall(0.2), cached=True))  # three probes of 16 rays a texel
     assert len(made) == caches
 
 
