@@ -37,7 +37,7 @@ from .settings import (
     of_reference,
     unit,
 )
-from .snapshot import Snapshot, SnapshotError
+from .snapshot import ProbeEdits, Snapshot, SnapshotError
 
 EXPECTED = (SnapshotError, SettingsError, container.FileError, OSError, ValueError, MemoryError)
 """Errors that are the input's fault: one line, no traceback."""
@@ -269,19 +269,20 @@ def _run_bake(options, extract: Extract, progress: Progress) -> dict:
         raise SettingsError("--minutes and --incremental: one or the other, as only whole cells can be remembered")
     check_target(options.output)
     snapshot = _read_scene(options.scene, extract, progress)
-    wish = _wish(options.probes, options.probe_megabytes, probe_job.spending_of(settings))
+    wish = _wish(options.probes, options.probe_megabytes, probe_job.spending_of(settings), snapshot.probes)
     manner = job.Manner(options.threads, options.early, options.incremental, 60 * options.minutes, wish)
     outcome = job.bake(snapshot, options.output, settings, options.cells, manner, progress)
     return dataclasses.asdict(outcome)
 
 
-def _wish(probes: str | int, megabytes: float | None, spending: Spending) -> Wish | None:
+def _wish(probes: str | int, megabytes: float | None, spending: Spending, edits: ProbeEdits) -> Wish | None:
     """Which reflection probes were asked for."""
     if probes == "none":
         return None
+    given = {"spending": spending, "pinned": edits.pinned, "deleted": edits.deleted}
     if probes == "auto":
-        return Wish(megabytes=megabytes or probe_job.AUTOMATIC, spending=spending, only_if_glossy=True)
-    return Wish(probes, megabytes, least_gain=0.0, spending=spending)
+        return Wish(megabytes=megabytes or probe_job.AUTOMATIC, only_if_glossy=True, **given)
+    return Wish(probes, megabytes, least_gain=0.0, **given)
 
 
 def _settings(options, samples: int, bounces: int, finest: float = 0.0) -> Settings:

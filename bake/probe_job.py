@@ -68,7 +68,7 @@ class Wish:
     spending : Spending, how good maps are to be
     pinned : (m, 3) float64, probes that are there anyway, world coordinates [m]
     deleted : (b, 2, 3) float64, lowest and highest corners of boxes that get no others, world coordinates [m]
-    only_if_glossy : whether there are to be none where hardly any surface shows reflections
+    only_if_glossy : whether there are to be none but pinned ones where hardly any surface shows reflections
     """
 
     count: int = 1000
@@ -159,10 +159,7 @@ def why_none(job: Job) -> str:
     """
     if not job.parts:
         return "there is no light to reflect"
-    share = glossy_share(job.scene) if job.wish.only_if_glossy else 1.0
-    if share >= LEAST_GLOSSY:
-        return ""
-    return f"{100 * share:.1f} % of all surfaces are smoother than roughness {ROUGH}; --probes N makes them anyway"
+    return "" if len(job.wish.pinned) else _dullness(job)
 
 
 def run(job: Job, show: Callable[[float], bool] = lambda share: True) -> Made:
@@ -239,9 +236,18 @@ def _digest(job: Job, trees: tuple[Topology, ...]) -> str:
     """Hash of all that probes depend on besides the bake."""
     wish, effort = job.wish, job.effort
     asked = [wish.count, wish.megabytes, wish.least_gain, wish.spending.error, wish.spending.most, wish.spending.pitch]
+    asked += [wish.only_if_glossy]
     asked += [np.asarray(wish.pinned, np.float64).tolist(), np.asarray(wish.deleted, np.float64).tolist()]
     done = [effort.bounces, effort.seed, [tree.cell for tree in trees]]
     return hashlib.blake2b(json.dumps([FORMAT, asked, done]).encode(), digest_size=16).hexdigest()
+
+
+def _dullness(job: Job) -> str:
+    """Why surfaces ask for no probes; empty where they do, or where that does not count."""
+    share = glossy_share(job.scene) if job.wish.only_if_glossy else 1.0
+    if share >= LEAST_GLOSSY:
+        return ""
+    return f"{100 * share:.1f} % of all surfaces are smoother than roughness {ROUGH}; --probes N makes them anyway"
 
 
 def _request(job: Job) -> Request:
@@ -249,7 +255,8 @@ def _request(job: Job) -> Request:
     wish, size = job.wish, probe_bytes(job.wish.spending.pitch, len(job.parts))
     pinned, deleted = (np.asarray(part, np.float64) - job.scene.origin for part in (wish.pinned, wish.deleted))
     counts = functools.partial(are_lit, job.scene, job.effort) if job.parts else None
-    return Request(wish.count, wish.megabytes, size, wish.least_gain, pinned, deleted, counts)
+    count = len(pinned) if _dullness(job) else wish.count
+    return Request(count, wish.megabytes, size, wish.least_gain, pinned, deleted, counts)
 
 
 def _shoot_all(job: Job, studio: Studio, trees: tuple[Topology, ...], show: Callable[[float], bool]) -> None:

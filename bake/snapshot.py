@@ -171,6 +171,18 @@ class Note:
     why: str
 
 
+@dataclass(frozen=True, eq=False)
+class ProbeEdits:
+    """What an artist says about reflection probes; nothing else of a bake depends on it.
+
+    pinned : (m, 3) float64 [m], places in world space where probes are in any case
+    deleted : (b, 2, 3) float64 [m], lowest and highest corners of boxes in world space that get no others
+    """
+
+    pinned: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    deleted: np.ndarray = field(default_factory=lambda: np.zeros((0, 2, 3)))
+
+
 @dataclass(frozen=True)
 class Snapshot:
     """One scene.
@@ -188,4 +200,5 @@ class Snapshot:
     sky: np.ndarray
     cameras: tuple[Camera, ...] = ()
     notes: tuple[Note, ...] = ()
+    probes: ProbeEdits = field(default_factory=ProbeEdits)
     source: str = field(default="", compare=False)

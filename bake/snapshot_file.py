@@ -24,6 +24,7 @@ from .snapshot import (
     Lights,
     Material,
     Note,
+    ProbeEdits,
     Snapshot,
     SnapshotError,
     Texture,
@@ -55,6 +56,7 @@ LIGHTS_LAYOUT = {
     "reflector": (np.bool_, (None,)),
     "shadow": (np.bool_, (None,)),
 }
+PROBES_LAYOUT = {"pinned": (np.float64, (None, 3)), "deleted": (np.float64, (None, 2, 3))}
 CHANNELS = ("rgb", "r", "g", "b", "a")
 PIXEL_DTYPES = {"srgb": np.uint8, "linear": np.uint8, "float": np.float16}
 
@@ -116,7 +118,7 @@ def load(path: Path | str) -> Snapshot:
 
 
 def digest(snapshot: Snapshot) -> str:
-    """Hash everything that a bake depends on: no names, cameras or notes, nor where the scene came from.
+    """Hash everything that a bake's cells depend on: no names, cameras, notes or probes, nor where the scene came from.
 
     Parameters
     ----------
@@ -130,7 +132,7 @@ def digest(snapshot: Snapshot) -> str:
     """
     arrays, meta = _to_container(_nameless(snapshot))
     state = hashlib.blake2b(json.dumps(meta, sort_keys=True).encode(), digest_size=16)
-    for name in sorted(arrays):
+    for name in sorted(name for name in arrays if not name.startswith("probes/")):
         array = np.ascontiguousarray(arrays[name])
         state.update(f"{name}{array.dtype.str}{array.shape}".encode())
         state.update(array.data)
@@ -168,6 +170,9 @@ def check(snapshot: Snapshot) -> None:
     geometry, lights = snapshot.geometry, snapshot.lights
     _check_layout("geometry", geometry, GEOMETRY_LAYOUT)
     _check_layout("lights", lights, LIGHTS_LAYOUT)
+    _check_layout("probes", snapshot.probes, PROBES_LAYOUT)
+    low, high = snapshot.probes.deleted[:, 0], snapshot.probes.deleted[:, 1]
+    _require(bool((low <= high).all()), "probes.deleted: a lowest corner is above the highest one")
     _check_geometry(geometry, len(snapshot.materials))
     _require(len(lights.names) == len(lights.kind), "lights: one name for each lamp")
     _require(bool((lights.kind <= max(LightKind)).all()), "lights: kind is not a known shape")
@@ -294,6 +299,7 @@ def _is_amount(value: float) -> bool:
 def _to_container(snapshot: Snapshot) -> tuple[dict[str, np.ndarray], dict]:
     arrays = {f"geometry/{name}": getattr(snapshot.geometry, name) for name in GEOMETRY_LAYOUT}
     arrays |= {f"lights/{name}": getattr(snapshot.lights, name) for name in LIGHTS_LAYOUT}
+    arrays |= {f"probes/{name}": getattr(snapshot.probes, name) for name in PROBES_LAYOUT}
     arrays |= {f"image/{i}": image.pixels for i, image in enumerate(snapshot.images)}
     arrays |= {"sky": snapshot.sky, "origin": snapshot.origin}
     meta = {
@@ -314,6 +320,7 @@ def _from_container(arrays: dict[str, np.ndarray], meta: dict) -> Snapshot:
         raise ValueError(f"version {meta['version']}; this program reads up to {VERSION}")
     geometry = {name: arrays[f"geometry/{name}"] for name in GEOMETRY_LAYOUT}
     lights = {name: arrays[f"lights/{name}"] for name in LIGHTS_LAYOUT}
+    probes = {name: arrays[f"probes/{name}"] for name in PROBES_LAYOUT if f"probes/{name}" in arrays}
     labels = [(_build(str, entry["name"]), _build(str, entry["encoding"])) for entry in meta["images"]]
     return Snapshot(
         origin=arrays["origin"],
@@ -324,6 +331,7 @@ def _from_container(arrays: dict[str, np.ndarray], meta: dict) -> Snapshot:
         sky=arrays["sky"],
         cameras=_build(tuple[Camera, ...], meta["cameras"]),
         notes=_build(tuple[Note, ...], meta["notes"]),
+        probes=ProbeEdits(**probes),
         source=_build(str, meta["source"]),
     )
 

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 
 import bpy
 
-from . import dependencies, job, properties
+from . import dependencies, job, probe_operators, properties
 
 TICK_S = 0.2
 
@@ -43,7 +43,7 @@ class GIVOLUMES_OT_bake(bpy.types.Operator):
         except properties.SettingsError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        self._steps = started.steps()
+        self._steps, self._scene = started.steps(), context.scene.name
         if bpy.app.background or not self.options.is_invoke:
             return self._run_to_end(started)
         self._shown = None
@@ -109,6 +109,8 @@ class GIVOLUMES_OT_bake(bpy.types.Operator):
         if outcome.warnings:
             self.report({"WARNING"}, "; ".join(outcome.warnings))
         self.report({levels[outcome.kind]}, outcome.message)
+        if outcome.kind == "done" and probe_operators.refresh(bpy.data.scenes.get(self._scene)):
+            bpy.ops.ed.undo_push(message="Show Probes")
         return {"FINISHED"} if outcome.kind == "done" else {"CANCELLED"}
 
 

@@ -23,6 +23,7 @@ from .materials import Materials
 from .node_values import VALUES
 from .notes import Notes
 from .placement import Placements
+from .probe_marks import Marks, is_probe
 
 REC709 = "Linear Rec.709"
 # What renders but has no surface made of triangles.
@@ -93,8 +94,8 @@ def _read(depsgraph: bpy.types.Depsgraph, scene: bpy.types.Scene, notes: Notes) 
     """Everything but the sky, which Blender cannot render at the same time."""
     images = Images(notes)
     evaluator = Evaluator(images, notes, VALUES)
-    meshes, lamps = Meshes(notes, Materials(evaluator)), Lamps(notes, evaluator)
-    _gather(depsgraph, meshes, lamps, notes)
+    meshes, lamps, probes = Meshes(notes, Materials(evaluator)), Lamps(notes, evaluator), Marks()
+    _gather(depsgraph, meshes, lamps, probes, notes)
     if not meshes.instances:
         raise SnapshotError(_nothing(scene, lamps))
     return Snapshot(
@@ -105,11 +106,12 @@ def _read(depsgraph: bpy.types.Depsgraph, scene: bpy.types.Scene, notes: Notes) 
         lights=lamps.record(),
         sky=np.zeros((1, 1, 3), np.float32),
         cameras=cameras.read(depsgraph, scene.camera, cameras.picture_size(scene), notes),
+        probes=probes.record(scene),
         source=bpy.data.filepath,
     )
 
 
-def _gather(depsgraph: bpy.types.Depsgraph, meshes: Meshes, lamps: Lamps, notes: Notes) -> None:
+def _gather(depsgraph: bpy.types.Depsgraph, meshes: Meshes, lamps: Lamps, probes: Marks, notes: Notes) -> None:
     """Walk everything that renders."""
     placements = Placements()
     for instance in depsgraph.object_instances:
@@ -117,7 +119,9 @@ def _gather(depsgraph: bpy.types.Depsgraph, meshes: Meshes, lamps: Lamps, notes:
         name = object.name
         if not instance.show_self:
             continue
-        if isinstance(object.data, bpy.types.Mesh):
+        if is_probe(object):
+            probes.add(object, placements.matrix(instance), name)
+        elif isinstance(object.data, bpy.types.Mesh):
             if _lights_others(object, notes):
                 meshes.add(object, placements.matrix(instance), name)
         elif object.type == "LIGHT":

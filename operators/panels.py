@@ -39,6 +39,7 @@ class _Details:
 
     bl_label = "Settings"
     bl_options = {"DEFAULT_CLOSED"}
+    bl_order = 1  # below reflection probes
 
     def draw(self, context):
         layout = self.layout

@@ -3,7 +3,17 @@
 from pathlib import Path
 
 import bpy
-from bpy.props import BoolProperty, EnumProperty, IntProperty, PointerProperty, StringProperty
+from bpy.props import (
+    BoolProperty,
+    CollectionProperty,
+    EnumProperty,
+    FloatProperty,
+    IntProperty,
+    PointerProperty,
+    StringProperty,
+)
+
+from .probe_properties import GIVOLUMES_PG_object, GIVOLUMES_PG_place
 
 # In files of version 1 the finest voxels are a number, which Blender reads as the default, automatic.
 SCHEMA_VERSION = 2
@@ -22,6 +32,11 @@ SUNS = (
 SKIES = (
     ("scene", "Scene", "The world of the scene, as it stands"),
     ("harmonics", "Any Sky", "The sky may change at run time; larger files"),
+)
+PROBES = (
+    ("auto", "Automatic", "Reflection probes where surfaces are glossy, as many as the budget allows"),
+    ("count", "Count", "So many reflection probes, whatever the materials"),
+    ("none", "None", "No reflection probes"),
 )
 AUTOMATIC = "automatic"
 # The grid's levels are powers of two; scenes of another scale than people's get theirs from the automatic choice.
@@ -86,6 +101,30 @@ class GIVOLUMES_PG_scene(bpy.types.PropertyGroup):
         default=0,
         min=0,
     )
+    probes: EnumProperty(
+        name="Probes",
+        description="Which reflection probes the bake makes; pinned ones are made unless there are to be none",
+        items=PROBES,
+        default="auto",
+    )
+    probe_count: IntProperty(
+        name="Count",
+        description="How many reflection probes, pinned ones among them (50 by default)",
+        default=50,
+        min=0,
+        soft_max=1000,
+    )
+    probe_megabytes: FloatProperty(
+        name="Budget (MB)",
+        description="Most that reflection probes take as textures [MB]; 0 (the default) is 32 MB for automatic probes"
+        " and no limit for a count. Pinned ones are made in any case",
+        default=0.0,
+        min=0.0,
+        soft_max=1024.0,
+    )
+    placed_probes: CollectionProperty(type=GIVOLUMES_PG_place, options={"HIDDEN"})
+    deleted_probes: CollectionProperty(type=GIVOLUMES_PG_place, options={"HIDDEN"})
+    shown_probes: StringProperty(options={"HIDDEN"})
 
 
 class GIVOLUMES_PG_light(bpy.types.PropertyGroup):
@@ -98,18 +137,28 @@ class GIVOLUMES_PG_light(bpy.types.PropertyGroup):
     )
 
 
-CLASSES = (GIVOLUMES_PG_scene, GIVOLUMES_PG_light)
+CLASSES = (GIVOLUMES_PG_place, GIVOLUMES_PG_object, GIVOLUMES_PG_scene, GIVOLUMES_PG_light)
 
 
 def attach() -> None:
-    """Give scenes and lamps their settings."""
+    """Give scenes, objects and lamps their settings."""
     bpy.types.Scene.gi_volumes = PointerProperty(type=GIVOLUMES_PG_scene)
+    bpy.types.Object.gi_volumes = PointerProperty(type=GIVOLUMES_PG_object)
     bpy.types.Light.gi_volumes = PointerProperty(type=GIVOLUMES_PG_light)
+
+
+def attach_alone() -> None:
+    """Give them their settings where the extension is not enabled, so that a file's can be read."""
+    if not hasattr(bpy.types.Scene, "gi_volumes"):
+        for group in CLASSES:
+            bpy.utils.register_class(group)
+        attach()
 
 
 def detach() -> None:
     """Take the settings away again."""
     del bpy.types.Light.gi_volumes
+    del bpy.types.Object.gi_volumes
     del bpy.types.Scene.gi_volumes
 
 
@@ -166,4 +215,14 @@ def arguments(scene: bpy.types.Scene) -> dict[str, str]:
         options["--finest"] = settings.finest
     if settings.threads:
         options["--threads"] = str(settings.threads)
+    return options | _probe_arguments(settings)
+
+
+def _probe_arguments(settings: GIVOLUMES_PG_scene) -> dict[str, str]:
+    """The options for reflection probes."""
+    options = {}
+    if settings.probes != "auto":
+        options["--probes"] = str(settings.probe_count) if settings.probes == "count" else settings.probes
+    if settings.probe_megabytes:
+        options["--probe-megabytes"] = f"{settings.probe_megabytes:g}"
     return options

@@ -4,9 +4,25 @@ from __future__ import annotations
 
 import bpy
 
-from . import bake_operator, clear_operator, command, job, panels, properties
+from . import (
+    bake_operator,
+    clear_operator,
+    command,
+    job,
+    panels,
+    probe_operators,
+    probe_panels,
+    properties,
+)
 
-CLASSES = (*properties.CLASSES, *bake_operator.CLASSES, *clear_operator.CLASSES, *panels.CLASSES)
+CLASSES = (
+    *properties.CLASSES,
+    *bake_operator.CLASSES,
+    *clear_operator.CLASSES,
+    *probe_operators.CLASSES,
+    *panels.CLASSES,
+    *probe_panels.CLASSES,
+)
 
 _register_classes, _unregister_classes = bpy.utils.register_classes_factory(CLASSES)
 _commands: list[object] = []

@@ -56,8 +56,9 @@ def write(scene: Path, output: Path) -> None:
             "or bake inside Blender: blender -b FILE --command gi_volumes bake"
         )
     from ..bake import snapshot_file
-    from . import extract
+    from . import extract, properties
 
+    properties.attach_alone()
     snapshot_file.save(extract.from_file(scene), output)
 
 

@@ -14,6 +14,7 @@ import pytest
 from command_line import QUICK, call, stored, succeed
 from gi_volumes.bake import cell_job, cli, probe_job, radiosity
 from gi_volumes.bake.capture import Spending
+from gi_volumes.bake.changes import causes
 from gi_volumes.bake.gather import Effort
 from gi_volumes.bake.job import Manner, bake
 from gi_volumes.bake.lit_patches import are_lit
@@ -23,7 +24,8 @@ from gi_volumes.bake.probe_job import Job, Made, Wish, probe_bytes, run
 from gi_volumes.bake.probes import RequestError
 from gi_volumes.bake.scene import Model, prepare
 from gi_volumes.bake.settings import Settings, model
-from gi_volumes.bake.snapshot import Channel, Material, Snapshot
+from gi_volumes.bake.snapshot import Channel, Material, ProbeEdits, Snapshot
+from gi_volumes.bake.survey import Judge
 from gi_volumes.tree import folder, probe_file
 from gi_volumes.tree.verify import verify
 
@@ -69,7 +71,7 @@ def target(baked, tmp_path) -> Path:
 
 
 def bytes_in(target: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in target.iterdir()}
+    return {path.name: path.read_bytes() for path in target.iterdir() if path.is_file()}
 
 
 def test_probes_are_placed_captured_listed_and_found_sound(target):
@@ -265,6 +267,47 @@ def test_the_command_says_why_a_dull_scene_has_none_and_makes_them_if_asked(tmp_
     assert why.startswith("0.0 % of all surfaces are smoother than roughness 0.4; --probes N")
     said = call("bake", tmp_path / "level.giv", "-o", tmp_path / "bake", *QUICK, "--probes", "1").out
     assert re.search(r"^1 reflection probes, 0\.\d\d MB, \d+ rays a texel, noise \d+\.\d %$", said, re.MULTILINE)
+
+
+def said_by(snapshot: Snapshot, *pinned: np.ndarray, deleted: tuple = ()) -> Snapshot:
+    """The scene with what an artist says about its probes."""
+    edits = ProbeEdits(np.array(pinned).reshape(-1, 3), np.array(deleted, float).reshape(-1, 2, 3))
+    return dataclasses.replace(snapshot, probes=edits)
+
+
+@pytest.mark.parametrize("words", [(), ("--incremental",)])
+def test_what_an_artist_says_makes_probes_anew_and_keeps_the_cells_to_the_last_byte(tmp_path, words):
+    words = ("--probes", "2", *words)
+    made_by_command(hall(0.2), tmp_path, *words)
+    first = bytes_in(tmp_path / "bake")
+    box = (at(0, 0, 0), at(5, 9, 9))
+    again = made_by_command(said_by(hall(0.2), at(8, 4, 2), deleted=box), tmp_path, *words)
+    second = bytes_in(tmp_path / "bake")
+    assert again["probes"]["rays"] > 0
+    changed = {name for name in first if second[name] != first[name]}
+    assert changed == {"probes.exr", "scene.giv", "world.json"}
+    maps = probe_file.load(tmp_path / "bake", folder.load_header(tmp_path / "bake"))
+    assert maps.pinned.tolist() == [True, False]
+    assert maps.position[0] == pytest.approx(at(8, 4, 2))
+    assert not ((maps.position[1] >= box[0]) & (maps.position[1] <= box[1])).all()
+    assert succeed("verify", tmp_path / "bake") == {"defects": []}
+    made_by_command(hall(0.2), tmp_path, *words)
+    assert bytes_in(tmp_path / "bake") == first
+
+
+def test_what_an_artist_says_changes_nothing_that_light_depends_on():
+    judge = Judge(np.ones((1, 2, 3)), np.ones((2, 3)))
+    found = []
+    for snapshot in (hall(0.2), said_by(hall(0.2), at(8, 4, 2), deleted=(at(0, 0, 0), at(5, 9, 9)))):
+        effective, light = model(snapshot, SETTINGS)
+        found.append(causes(effective, prepare(effective, light), judge))
+    assert found[0] == found[1]
+
+
+def test_a_dull_scene_gets_its_pinned_probes_and_no_others(tmp_path):
+    assert made_by_command(said_by(hall(0.2), at(8, 4, 2), at(3, 4, 2)), tmp_path)["probes"]["count"] == 2
+    said = made_by_command(said_by(hall(0.2), at(8, 4, 2)), tmp_path, "--probes", "none")
+    assert {"what": "probes", "why": "none were asked for"} in said["left_out"]
 
 
 def test_some_cells_alone_have_no_probes_yet(tmp_path):

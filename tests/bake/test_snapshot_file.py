@@ -16,6 +16,7 @@ from gi_volumes.bake.snapshot import (
     LightKind,
     Material,
     Note,
+    ProbeEdits,
     Snapshot,
     SnapshotError,
     Texture,
@@ -66,6 +67,7 @@ def scene() -> Snapshot:
             Camera("top", matrix, 4.0, orthographic=True),
         ),
         notes=(Note("hair", "not a mesh"),),
+        probes=ProbeEdits(rng.normal(size=(2, 3)), np.sort(rng.normal(size=(3, 2, 3)), axis=1)),
         source="level.blend",
     )
 
@@ -180,9 +182,9 @@ def test_the_digest_changes_with_any_setting_of_a_material_or_image(path):
     assert snapshot_file.digest(with_field(snapshot, path, VALUES[path])) != snapshot_file.digest(snapshot)
 
 
-def test_the_digest_does_not_change_with_cameras_notes_or_the_source():
+def test_the_digest_does_not_change_with_cameras_notes_probes_or_the_source():
     snapshot = scene()
-    other = dataclasses.replace(snapshot, cameras=(), notes=(), source="elsewhere.blend")
+    other = dataclasses.replace(snapshot, cameras=(), notes=(), probes=ProbeEdits(), source="elsewhere.blend")
     assert snapshot_file.digest(other) == snapshot_file.digest(snapshot)
 
 
@@ -282,6 +284,11 @@ VIOLATIONS = {
     "an infinite specular level": ("materials.0.specular_level", lambda a: np.inf, "specular_level: must be"),
     "a negative specular level": ("materials.0.specular_level", lambda a: -0.5, "specular_level: must be"),
     "a NaN cutoff": ("materials.1.alpha_cutoff", lambda a: np.nan, "alpha_cutoff: must be"),
+    "a NaN probe": ("probes.pinned", lambda a: holding(a, np.nan), "probes.pinned: holds NaN"),
+    "a probe on a plane": ("probes.pinned", lambda a: a[:, :2], "probes.pinned: want float64"),
+    "a deleted place": ("probes.deleted", lambda a: a[:, 0], "probes.deleted: want float64"),
+    "an infinite deleted box": ("probes.deleted", lambda a: holding(a, -np.inf), "probes.deleted: holds NaN"),
+    "a deleted box inside out": ("probes.deleted", lambda a: a[:, ::-1], "probes.deleted: a lowest corner"),
     "a camera of eleven numbers": ("cameras.0.world_from_camera", lambda a: a[:11], "camera 'main'"),
     "a NaN camera": ("cameras.0.half_width", lambda a: np.nan, "camera 'main'"),
     "a camera without pixels": ("cameras.1.resolution", lambda a: (0, 10), "camera 'top'"),
@@ -313,9 +320,17 @@ def rewritten(tmp_path, change):
     return tmp_path / "bad.giv"
 
 
+def test_a_file_that_says_nothing_of_probes_has_none_and_the_same_digest(tmp_path):
+    path = rewritten(tmp_path, lambda arrays, meta: [arrays.pop(f"probes/{name}") for name in ("pinned", "deleted")])
+    loaded = snapshot_file.load(path)
+    assert same(loaded, dataclasses.replace(BASE, probes=ProbeEdits()))
+    assert snapshot_file.digest(loaded) == snapshot_file.digest(BASE)
+
+
 SPOILED = {
     "no positions": lambda arrays, meta: arrays.pop("geometry/positions"),
     "no sky": lambda arrays, meta: arrays.pop("sky"),
+    "probes that are words": lambda arrays, meta: arrays.update({"probes/pinned": np.zeros((2, 3), np.int32)}),
     "no image": lambda arrays, meta: arrays.pop("image/1"),
     "no materials": lambda arrays, meta: meta.pop("materials"),
     "materials as a word": lambda arrays, meta: meta.update(materials="none"),

@@ -42,6 +42,14 @@ def start(quality: str, output: str):
     return job().current
 
 
+def open_panel(name: str) -> None:
+    """Make a panel that is closed by default an open one, before it is drawn for the first time."""
+    panel = getattr(bpy.types, name)
+    bpy.utils.unregister_class(panel)
+    panel.bl_options = set()
+    bpy.utils.register_class(panel)
+
+
 def add_slow_mesh() -> None:
     """Something that takes long enough to bake to be cancelled: curved, and larger than the finest voxels."""
     with bpy.context.temp_override(**view()):
@@ -66,9 +74,36 @@ def until(condition, running=None):
     raise AssertionError(f"waited in vain; the last bake: {job().last}")
 
 
+def probes(where: dict):
+    """Show a room's probes, move one, bake again: the others follow by themselves, and that can be undone."""
+    room = bpy.data.objects["Cube"]
+    room.scale = (4.0, 4.0, 4.0)
+    room.data.flip_normals()
+    bpy.context.scene.gi_volumes.probes, bpy.context.scene.gi_volumes.probe_count = "count", 2
+    running = start("draft", "finished")
+    yield from until(lambda: job().current is None, running)
+    with bpy.context.temp_override(**where):
+        assert bpy.ops.gi_volumes.place_probes("INVOKE_DEFAULT") == {"FINISHED"}
+    moved = bpy.data.collections["GI Probes"].objects[0]
+    moved.select_set(True)
+    bpy.context.view_layer.objects.active = moved
+    moved.location = (3.0, 3.0, 3.0)
+    yield
+    picture("3_probes")
+    running = start("draft", "finished")
+    yield from until(lambda: job().current is None, running)
+    shown = bpy.data.collections["GI Probes"].objects
+    seen["probes"] = sorted(object.gi_volumes.pinned for object in shown)
+    with bpy.context.temp_override(**where):
+        bpy.ops.ed.undo()
+    yield
+    seen["steps"].append(["probes", job().last.kind])
+
+
 def scenario():
     """Everything that an artist does, one `yield` per timer tick."""
     bpy.ops.extensions.package_install_files(filepath=str(ARCHIVE), repo=REPOSITORY, enable_on_install=True)
+    open_panel("GIVOLUMES_PT_sidebar_probes")
     where = view()
     where["area"].spaces.active.show_region_ui = True
     yield
@@ -83,10 +118,12 @@ def scenario():
     seen["message"] = job().last.message
     picture("2_finished")
 
+    yield from probes(where)
+
     add_slow_mesh()
     running = start("final", "cancelled")
     yield from until(lambda: running.progress.stage == "Baking" and running.progress.fraction > 0, running)
-    picture("3_progress")
+    picture("4_progress")
     assert not bpy.ops.gi_volumes.bake.poll()
     where["window"].event_simulate(type="ESC", value="PRESS", x=300, y=300)
     yield from until(lambda: job().current is None, running)
@@ -98,7 +135,7 @@ def scenario():
     bpy.ops.gi_volumes.cancel()
     yield from until(lambda: job().current is None, running)
     seen["steps"].append(["cancel", job().last.kind])
-    picture("4_cancelled")
+    picture("5_cancelled")
 
     running = start("final", "disabled")
     yield from until(lambda: running.progress.stage == "Baking", running)
@@ -108,14 +145,14 @@ def scenario():
     bpy.ops.preferences.addon_enable(module=NAME)
     yield
     seen["steps"].append(["disable", "alive"])
-    picture("5_enabled_again")
+    picture("6_enabled_again")
 
     running = start("final", "left")
     yield from until(lambda: running.progress.stage == "Baking", running)
     bpy.ops.wm.read_homefile(app_template="")
     yield
     seen["steps"].append(["another file", "forgotten" if job().last is None else job().last.kind])
-    picture("6_another_file")
+    picture("7_another_file")
 
 
 def tick():

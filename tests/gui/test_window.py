@@ -72,6 +72,7 @@ def test_an_artist_bakes_in_the_window_cancels_and_bakes_to_the_end(blender, arc
     assert seen.get("done"), f"{seen.get('error')}\n{said}\npictures: {tmp_path}"
     assert seen["steps"] == [
         ["finish", "done"],
+        ["probes", "done"],
         ["escape", "stopped"],
         ["cancel", "stopped"],
         ["disable", "alive"],
@@ -79,6 +80,7 @@ def test_an_artist_bakes_in_the_window_cancels_and_bakes_to_the_end(blender, arc
     ]
     assert {"Reading the scene", "Baking", "Stopping"} <= set(seen["progress"])
     assert "data points" in seen["message"]
+    assert seen["probes"] == [False, True]
     assert (tmp_path / "finished" / "world.json").is_file()
     assert "Traceback" not in said
     assert code == 0

@@ -23,7 +23,8 @@ NAME = "bl_ext.dev.gi_volumes"
 
 def ours():
     types = [name for name in dir(bpy.types) if "GIVOLUMES" in name or "GI_VOLUMES" in name]
-    places = [owner.__name__ for owner in (bpy.types.Scene, bpy.types.Light) if hasattr(owner, "gi_volumes")]
+    places = [owner.__name__ for owner in (bpy.types.Scene, bpy.types.Object, bpy.types.Light)
+              if hasattr(owner, "gi_volumes")]
     handlers = [f for name in dir(bpy.app.handlers) if isinstance(h := getattr(bpy.app.handlers, name), list)
                 for f in h if f.__module__.startswith(NAME)]
     return types + places + handlers + list(dir(bpy.ops.gi_volumes))
@@ -149,6 +150,25 @@ assert bpy.context.scene.gi_volumes.quality == "final" and bpy.data.lights[0].gi
 """)
 
 
+def test_the_command_line_outside_of_blender_reads_the_settings_of_lamps_and_objects(blender, repository, tmp_path):
+    blender("""
+addon_utils.enable(NAME, default_set=True)
+bpy.data.lights[0].gi_volumes.reflector = True
+bpy.ops.gi_volumes.add_probe()
+bpy.context.object.location = (1, 2, 3)
+output.mkdir()
+bpy.ops.wm.save_as_mainfile(filepath=str(output / "a.blend"))
+""")
+    words = ["snapshot", str(tmp_path / "out" / "a.blend"), "-o", str(tmp_path / "a.giv")]
+    done = subprocess.run([sys.executable, str(repository / "__main__.py"), *words], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, "")
+    from gi_volumes.bake import snapshot_file
+
+    snapshot = snapshot_file.load(tmp_path / "a.giv")
+    assert snapshot.lights.reflector.tolist() == [True]
+    assert snapshot.probes.pinned.tolist() == [[1, 2, 3]]
+
+
 def test_a_finest_voxel_saved_as_a_number_is_read_as_automatic(blender):
     blender("""
 class Old(bpy.types.PropertyGroup):
@@ -180,7 +200,10 @@ scene.gi_volumes.output_folder, scene.gi_volumes.quality = str(output), "draft"
 print(bpy.ops.gi_volumes.bake(), bpy.ops.gi_volumes.clear())
 from bl_ext.dev.gi_volumes.operators import command
 print("CODE", command.main(["bake"]), command.main(["info", str(output)]), command.main(["verify", str(output)]))
-assert sorted(dir(bpy.ops.gi_volumes)) == ["bake", "cancel", "clear"]
+bpy.ops.gi_volumes.place_probes(), bpy.ops.gi_volumes.add_probe(), bpy.ops.gi_volumes.pin_probes()
+operators = ["add_probe", "bake", "cancel", "clear", "forget_deleted_probes", "pin_probes", "place_probes"]
+assert sorted(dir(bpy.ops.gi_volumes)) == operators
+assert bpy.ops.gi_volumes.forget_deleted_probes() == {"CANCELLED"}
 assert not bpy.ops.gi_volumes.cancel.poll()
 print("VIOLATIONS", addon_utils._extensions_warnings_get())
 """)
