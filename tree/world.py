@@ -1,4 +1,4 @@
-"""A bake, loaded: irradiance at any point for any normal. This is the definition of what the files mean.
+"""A bake, loaded: irradiance at any point for any normal, and radiance that rays meet: what the files mean.
 
     E(p, n) = E_local(p, n) + E_sun(p, n; sun direction) * sun irradiance + E_sky(p, n; sky radiance)   [W/m2]
 
@@ -9,6 +9,7 @@ three terms is clamped at 0 by itself, so that they add up whether they are aske
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -18,6 +19,9 @@ from .container import FileError
 from .grid import Grid
 from .interpolate import DataPoints, join
 from .lookup import Atlas
+from .probe_maps import ProbeMaps
+from .probe_sets import ProbeSets
+from .reflections import Rays, Reflections
 from .suns import SunKeys
 from .values import Values
 
@@ -30,6 +34,8 @@ LARGEST = np.finfo(np.float32).max / 100
 """Limit of coefficients, so that no sum of them overflows."""
 CHUNK = 1 << 16
 """Points handled at a time: few enough for some 50 MB, so many that calls cost little."""
+RAYS = 1 << 14
+"""Rays handled at a time, each with a dozen probes: some 100 MB."""
 REMEMBERED = 4
 """Combinations of transports, sun and sky whose coefficients are kept for the next look-up."""
 
@@ -43,6 +49,10 @@ class World:
         Content of `world.json`.
     cells : list of Cell
         All cells of the bake.
+    maps : ProbeMaps, optional
+        What its reflection probes see.
+    sets : sequence of ProbeSets
+        Which of them count where, of each cell; there are none without probes.
 
     Attributes
     ----------
@@ -54,7 +64,13 @@ class World:
         World cells (i, j) that are there.
     """
 
-    def __init__(self, header: dict, cells: list[folder.Cell]):
+    def __init__(
+        self,
+        header: dict,
+        cells: list[folder.Cell],
+        maps: ProbeMaps | None = None,
+        sets: Sequence[ProbeSets] = (),
+    ):
         self.header, self.grid = header, folder.grid_of(header)
         self.cells = np.array([cell.topology.cell for cell in cells], np.int64).reshape(-1, 2)
         self._data = _data_points(self.grid, cells)
@@ -67,6 +83,7 @@ class World:
         own = sun.get("scene") or []
         self._own_direction = np.array([entry["direction"] for entry in own], np.float64).reshape(-1, 3)
         self._own_irradiance = np.array([entry["irradiance"] for entry in own], np.float64).reshape(-1, 3)
+        self._reflections = Reflections(self._data, maps, sets) if maps is not None and len(maps.position) else None
 
     @property
     def sun_irradiance(self) -> np.ndarray:
@@ -124,11 +141,87 @@ class World:
             result[part] = self._evaluate(points[part], normals[part], values)
         return result
 
+    def radiance(
+        self,
+        points: np.ndarray,
+        directions: np.ndarray,
+        roughness: np.ndarray | float,
+        sun: tuple | None = None,
+        sky: np.ndarray | float | None = None,
+        normals: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Return the radiance that rays meet, blurred by a lobe about them: what a surface there mirrors.
+
+        Parameters
+        ----------
+        points : (n, 3) float64
+            World space [m]; anywhere, also outside the bake.
+        directions : (n, 3) float
+            Away from the points, of any length but 0: the mirror directions.
+        roughness : float or (n,) float
+            0 to 1; the lobe is that of `ggx.density`.
+        sun, sky
+            As for `irradiance`.
+        normals : (n, 3) float, optional
+            Of the surfaces that the points lie on, of any length; without them, or where they are zero, a wall
+            without thickness does not hide what lies behind it.
+
+        Returns
+        -------
+        (n, 3) float32
+            Radiance [W/(m2 sr)], finite and not negative. Where no probe sees what a ray meets it is the irradiance of
+            a surface that faces along the ray, over pi: as of a lobe as wide as a cosine.
+
+        Raises
+        ------
+        ValueError
+            For wrong shapes, input that is not finite, roughness out of range, a direction of no length, a sun or a
+            sky that the bake cannot represent.
+
+        Notes
+        -----
+        Error: see `docs/accuracy.md`. Continuous along a moving point, in direction and in roughness.
+        Source: the talk's rows 3 and 4.
+        """
+        normals = np.zeros_like(directions) if normals is None else normals
+        points, directions, normals = (
+            _check_rows(*pair) for pair in ((points, "points"), (directions, "directions"), (normals, "normals"))
+        )
+        roughness = _check_roughness(roughness, len(points))
+        if not len(points) == len(directions) == len(normals) == len(roughness):
+            counts = f"{len(directions)} directions, {len(normals)} normals, {len(roughness)} numbers of roughness"
+            raise ValueError(f"{len(points)} points, {counts}; as many are needed")
+        if not directions.any(axis=1).all():
+            raise ValueError(f"directions: row {int(np.argmin(directions.any(axis=1)))} has no length")
+        factors, result = self._factors(sun, sky, "all"), np.zeros((len(points), 3), np.float32)
+        points = clamp(self._data, self.grid.to_local(points))
+        directions, normals = (_unit(rows).astype(np.float32) for rows in (directions, normals))
+        for start in range(0, len(points), RAYS):
+            part = slice(start, start + RAYS)
+            rays = Rays(points[part], directions[part], roughness[part], normals[part])
+            result[part] = self._reflect(rays, factors)
+        return result
+
+    def _reflect(self, rays: Rays, factors: dict[str, np.ndarray]) -> np.ndarray:
+        """One chunk: what probes see, and what irradiance says where they see nothing."""
+        light, seen = np.zeros((len(rays.point), 3), np.float32), np.zeros(len(rays.point), np.float32)
+        if self._reflections is not None:
+            light, seen = self._reflections.look(rays, self._reflections.mixed(factors))
+        some = np.flatnonzero(seen < 1)
+        facing = np.where(rays.normal[some].any(axis=1, keepdims=True), rays.normal[some], rays.direction[some])
+        other = self._toward(rays.point[some], facing, rays.direction[some], self._folded(factors)) / np.float32(np.pi)
+        light[some] = seen[some, None] * light[some] + (1 - seen[some, None]) * other
+        return light
+
     def _evaluate(self, points: np.ndarray, normals: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """One chunk: the mean coefficients of all transports at once, then each along the normals."""
-        points, normals = clamp(self._data, self.grid.to_local(points)), _unit(normals)
-        functions = harmonics.basis(normals)
-        functions[:, 6] *= np.any(normals.T, axis=0)  # of no direction; the others are 0 there, but the constant
+        """One chunk of points in world space."""
+        normals = _unit(normals)
+        return self._toward(clamp(self._data, self.grid.to_local(points)), normals, normals, values)
+
+    def _toward(self, points: np.ndarray, normals: np.ndarray, facing: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """The mean coefficients of all transports at once, by the surfaces' normals, then each along what they face."""
+        functions = harmonics.basis(facing)
+        functions[:, 6] *= np.any(facing.T, axis=0)  # of no direction; the others are 0 there, but the constant
         mean = blend(self._data, values, points, normals)
         total = np.zeros((len(points), 3), np.float32)
         for first in range(0, mean.shape[1], 27):
@@ -272,6 +365,15 @@ def _check_rows(values: np.ndarray, what: str) -> np.ndarray:
     finite = np.isfinite(values)
     if not finite.all():
         raise ValueError(f"{what}: row {int(np.argmin(finite.all(axis=1)))} is not finite")
+    return values
+
+
+def _check_roughness(values: np.ndarray | float, count: int) -> np.ndarray:
+    """(n,) float64 from 0 to 1."""
+    values = np.asarray(values, np.float64)
+    values = np.full(count, values) if values.ndim == 0 else values
+    if values.ndim != 1 or not ((values >= 0) & (values <= 1)).all():
+        raise ValueError("roughness is a number from 0 to 1, or one for each point")
     return values
 
 
