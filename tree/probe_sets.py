@@ -73,27 +73,27 @@ def encode(probe: np.ndarray, weight: np.ndarray, valid: np.ndarray) -> ProbeSet
         raise ValueError("a weight of a probe is negative or not finite")
     if probe.size and not (probe.min() >= 0 and probe.max() < MOST_PROBES):
         raise ValueError(f"probes {probe.min()} to {probe.max()}; 16 bits number {MOST_PROBES}")
-    probe, weight = _in_order(probe, _rounded(weight))
+    probe, weight = _in_order(*_rounded(*_in_order(probe, weight)))
     first, rank = distinct(np.concatenate([probe, weight.astype(np.uint16)], axis=1))
     index = np.full(len(valid), NO_DATA, np.uint16)
     index[valid] = rank
     return ProbeSets(index, probe[first], weight[first])
 
 
-def _rounded(weight: np.ndarray) -> np.ndarray:
-    """(n, slots) uint8 weights that sum to `WHOLE`; what rounding down leaves goes to the largest remainders."""
+def _rounded(probe: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Probes, and uint8 weights that sum to `WHOLE`; what rounding down leaves goes to the largest remainders."""
     total = weight.sum(axis=1, keepdims=True)
     exact = WHOLE * weight / np.where(total > 0, total, 1)
     floor = np.floor(exact)
     missing = np.where(total > 0, WHOLE, 0) - floor.sum(axis=1, keepdims=True)
     rank = np.argsort(np.argsort(floor - exact, axis=1, kind="stable"), axis=1, kind="stable")
-    return (floor + (rank < missing)).astype(np.uint8)
+    return probe, (floor + (rank < missing)).astype(np.uint8)
 
 
 def _in_order(probe: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Entries in the one order in which they are stored."""
     probe = np.where(weight > 0, probe, 0).astype(np.uint16)
-    order = np.lexsort((probe, -weight.astype(np.int64)), axis=1)
+    order = np.lexsort((probe, -weight.astype(np.float64)), axis=1)
     return np.take_along_axis(probe, order, 1), np.take_along_axis(weight, order, 1)
 
 

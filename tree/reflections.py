@@ -33,8 +33,8 @@ ENOUGH = 0.02
 NEAR = np.float32(4)
 """Distance from a probe at which it counts by a half, in lengths of the ray; as in `bake/views.py`."""
 
-LEAST = np.float32(1e-6)
-"""What a probe counts at least, so that rays of no length have a mean."""
+LEAST = np.float32(0.1)
+"""What a probe counts at least: where rays are short, none is to count alone for seeing something far behind."""
 
 WIDEST = np.float32(1)
 """Largest ratio that a lobe is widened by."""
