@@ -1,11 +1,10 @@
 """Where a ray meets what a probe sees: a few fixed steps along the ray, compared with the probe's distances.
 
 Comes in: offsets of points from probes, directions of rays. Goes out: in which directions the probe shows what the
-rays meet, with weights. With a = point - probe and s from 0 to 1, the ray runs through v(s) = (1 - s) a + s |a| d as
-the probe sees it. Let |v| be the sum of the components' magnitudes and N the reciprocal of the same distance of what
-the probe sees there: then m(s) = |v| N(v) is 1 - s where the ray meets it, more behind and less before. Along a plane m
-is linear in s, and N is in the map's coordinates: planes are met exactly, at any number of texels. At s = 1 all rays
-end, at infinity; the sky lies there.
+rays meet, with weights. With a = point - probe and r from 1 to 0, the ray runs through v(r) = r a + (1 - r) |a| d as
+the probe sees it, 0 being infinity. Let |v| be the sum of the components' magnitudes and N the reciprocal of the same
+distance of what the probe sees there: m(r) = |v| N(v) is r where the ray meets it, more behind and less before. Along a
+plane m is linear in r, and N is in the map's coordinates: planes are met exactly, at any number of texels.
 """
 
 from __future__ import annotations
@@ -24,25 +23,34 @@ STEPS = 8
 """Parts of the ray: with six errors are 3 % larger, with twelve they are no smaller (`docs/accuracy.md`)."""
 
 SOFT = 0.03
-"""How far behind what the probe sees a point has to be for the ray to have ended, in its distance: no pop where a ray
-begins to touch something."""
+"""Distance from what the probe sees within which it is open whether a point lies before or behind, in its distance: no
+pop where a ray begins to touch something."""
 
 SLACK = 0.15
 """How far off the point of a ray may be from what the probe sees there, in its distance, to count at all. The probe
 does not see what lies behind an edge: there no point of the ray is close to anything that it sees."""
+
+REFINED = 1
+"""Times that a step is cut where the ray meets something. The more often, the more edges look like surfaces."""
+
+ASIDE = 0.5
+"""How far beside a step the line between its ends may meet what is seen, in steps."""
 
 SHORT = 0.05
 """Length of rays below which what they meet cannot be told from where they start, in the probe's distance: two texels.
 Behind a thin wall rays seem to end at its other side, at once."""
 
 LOST = 0.3
-"""Part of a ray's weight that ends with each step behind what the probe sees: what it meets may well lie there."""
+"""Part of a ray that ends with each step behind what the probe sees: what it meets may well lie there."""
 
 LEAST = 1e-3
-"""Weight of a ray that isn't followed any further."""
+"""Part of a ray that isn't followed any further."""
 
-TINY = np.float32(1e-20)
-"""Keeps quotients finite [m]."""
+SHORTEST = np.float32(1e-20)
+"""Least distance from a probe [m]: any is right there, as all directions are that of the ray."""
+
+TINY = np.float32(1e-30)
+"""Keeps quotients finite."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,27 +140,38 @@ def march(near: Nearness, probe: np.ndarray, offset: np.ndarray, direction: np.n
 
     Notes
     -----
-    Error: exact in convex rooms with plane walls; else measured in `docs/accuracy.md`. Continuous in start and way: a
-    part of the ray counts by how far its end lies behind what is seen, and by how close what is found lies to it.
+    Error: exact in convex rooms with plane walls; else measured in `docs/accuracy.md`. Continuous in start and way:
+    parts of the ray are before what is seen, or behind it, and change sides as far as the end of a step is surely
+    before or behind. Of those that go behind only what meets a surface on the way is found.
     Source: Szirmay-Kalos et al. 2005, "Approximate Ray-Tracing on the GPU with Distance Impostors"; the rest is ours.
     """
     rays = _Rays(near, probe, offset, direction)
-    low = rays.gap(0.0)
-    left = 1 - LOST * low.hidden
+    low = rays.gap(1.0)
+    behind = np.clip(low.value / np.maximum(low.m, TINY) * np.float32(-1 / SOFT), 0, 1)
+    before, behind = 1 - behind, behind * np.float32(1 - LOST)
     for step in range(1, STEPS + 1):
-        high = rays.gap(step / STEPS)
-        yield rays.ends(step, low, high, left)
-        rays.pierce(step, low, high, left)
+        high = rays.gap(1 - step / STEPS)
+        goes, comes = before * high.hidden, behind * (1 - high.hidden)
+        found, unsure = rays.met(low, high, goes)
+        yield found
+        before = before - goes + rays.through(low, high, comes)
+        behind = (behind - comes + unsure) * np.float32(1 - LOST)
         low = high
 
 
 @dataclass(frozen=True, eq=False)
 class _Gap:
-    """How far points of rays are before what probes see: `value` is 1 - s - m(s); how surely before, and behind."""
+    """How far points r of rays are before what probes see: `value` is r - `m`; how surely they are behind it."""
 
+    r: float
     value: np.ndarray
-    before: np.ndarray
-    hidden: np.ndarray
+    m: np.ndarray
+
+    @property
+    def hidden(self) -> np.ndarray:
+        """(n,) 0 to 1; a half at the surface. At infinity everything is behind, the sky too."""
+        off = self.value / np.maximum(np.maximum(self.m, np.float32(self.r)), TINY)
+        return np.clip((1 - off * np.float32(1 / SOFT)) / 2, 0, 1) if self.r > 0 else np.ones_like(off)
 
 
 class _Rays:
@@ -161,58 +180,67 @@ class _Rays:
     def __init__(self, near: Nearness, probe: np.ndarray, offset: np.ndarray, direction: np.ndarray) -> None:
         length = np.sqrt((offset * offset).sum(axis=1, keepdims=True))
         self._near, self._probe, self._offset = near, probe, offset
-        self._length = np.maximum(length, TINY)
+        self._length = np.maximum(length, SHORTEST)
         self._way = self._length * direction
 
-    def gap(self, s: float) -> _Gap:
-        """Of the points s of all rays; at infinity everything is behind, the sky too."""
-        m = self._near.at(self._probe, (1 - s) * self._offset + s * self._way)
-        value = np.float32(1 - s) - m
-        before = np.clip(value / np.float32(SOFT * max(1 - s, TINY)), 0, 1)
-        hidden = np.clip(-value / np.maximum(m, TINY) / np.float32(SOFT), 0, 1)
-        return _Gap(value, before, hidden if s < 1 else np.ones_like(m))
+    def gap(self, r: float) -> _Gap:
+        """Of the points r of all rays."""
+        m = self._near.at(self._probe, r * self._offset + (1 - r) * self._way)
+        return _Gap(r, np.float32(r) - m, m)
 
-    def ends(self, step: int, low: _Gap, high: _Gap, left: np.ndarray) -> Found:
-        """What rays meet within a step, from before; what is left of their weight is changed in place."""
-        row = np.flatnonzero((high.hidden > 0) & (left > LEAST))
-        toward, sure, ratio = self._meet(row, step, low.value[row], high.value[row])
-        share = left[row] * high.hidden[row]
-        left[row] -= share * (sure + (1 - sure) * np.float32(LOST))
-        weight = share * sure * np.minimum(ratio / np.float32(SHORT), 1)
+    def met(self, low: _Gap, high: _Gap, goes: np.ndarray) -> tuple[Found, np.ndarray]:
+        """What the parts of rays meet that go behind within a step, and (n,) what of them meets nothing."""
+        row = np.flatnonzero(goes > LEAST)
+        toward, sure, ratio = self._meet(row, low, high, 1)
+        weight, unsure = goes[row] * sure, np.zeros_like(goes)
+        unsure[row] = goes[row] - weight
+        weight *= np.minimum(ratio / np.float32(SHORT), 1)
         some = np.flatnonzero(weight > 0)
-        return Found(row[some], toward[some], weight[some], ratio[some])
+        return Found(row[some], toward[some], weight[some], ratio[some]), unsure
 
-    def pierce(self, step: int, low: _Gap, high: _Gap, left: np.ndarray) -> None:
-        """End rays that come through a surface from its other side, where the probe does not see them."""
-        strength = np.minimum(low.hidden, high.before)
-        row = np.flatnonzero((strength > 0) & (left > LEAST))
-        _, sure, _ = self._meet(row, step, low.value[row], high.value[row])
-        left[row] *= 1 - strength[row] * sure
+    def through(self, low: _Gap, high: _Gap, comes: np.ndarray) -> np.ndarray:
+        """(n,) parts of rays that come forward within a step, less those that would have to come through a surface."""
+        row = np.flatnonzero(comes > LEAST)
+        left = comes.copy()
+        left[row] *= 1 - self._meet(row, low, high, -1)[1]
+        return left
 
-    def _meet(self, row: np.ndarray, step: int, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, ...]:
-        """(m, 3) where rays meet what is seen within a step, with gaps at both ends, (m,) how surely, and `ratio`."""
-        begin, end = np.float32((step - 1) / STEPS), np.float32(step / STEPS)
-        root = np.maximum(_root(begin, end, low, high), 0)
-        middle = self._at(row, root)[1]
-        first = (middle > 0) == (high > 0)
-        ends = np.where(first, begin, root), np.where(first, root, end)
-        closer = _root(*ends, np.where(first, low, middle), np.where(first, middle, high))
-        root = np.where((low > 0) != (high > 0), closer, root)
+    def _meet(self, row: np.ndarray, low: _Gap, high: _Gap, side: int) -> tuple[np.ndarray, ...]:
+        """(m, 3) where some rays meet what is seen within a step or close to it, from before (1) or from behind (-1),
+        (m,) how surely, and `ratio`."""
+        ends = np.float32(low.r), np.float32(high.r)
+        gaps = low.value[row] * side, high.value[row] * side
+        root, aside = _line(ends, gaps)
+        is_between = (gaps[0] > 0) != (gaps[1] > 0)
+        for _ in range(REFINED):
+            root = np.where(is_between, self._closer(row, ends, gaps, root, side), root)
         toward, gap, m = self._at(row, root)
-        off = np.abs(gap) / np.maximum(np.maximum(1 - root, m), TINY)
-        ratio = self._length[row, 0] * root / np.maximum(np.sqrt((toward * toward).sum(axis=1)), TINY)
-        return toward, np.maximum(1 - off / np.float32(SLACK), 0), ratio
+        off = np.abs(gap) / np.maximum(np.maximum(root, m), TINY)
+        sure = np.maximum(1 - off / np.float32(SLACK), 0) * np.clip(4 * (1 - aside / np.float32(ASIDE)), 0, 1)
+        ratio = self._length[row, 0] * (1 - root) / np.maximum(np.sqrt((toward * toward).sum(axis=1)), TINY)
+        return toward, sure, ratio
 
-    def _at(self, row: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Points s of some rays, their gaps, and m(s)."""
-        toward = (1 - s)[:, None] * self._offset[row] + s[:, None] * self._way[row]
+    def _closer(self, row: np.ndarray, ends: tuple, gaps: tuple, root: np.ndarray, side: int) -> np.ndarray:
+        """Where the line meets what is seen in the part of a step that is left after a first try."""
+        gap = self._at(row, root)[1] * side
+        is_later = (gap > 0) == (gaps[0] > 0)
+        ends = np.where(is_later, root, ends[0]), np.where(is_later, ends[1], root)
+        return _line(ends, (np.where(is_later, gap, gaps[0]), np.where(is_later, gaps[1], gap)))[0]
+
+    def _at(self, row: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Points r of some rays, their gaps, and m(r)."""
+        toward = r[:, None] * self._offset[row] + (1 - r)[:, None] * self._way[row]
         m = self._near.at(self._probe[row], toward)
-        return toward, 1 - s - m, m
+        return toward, r - m, m
 
 
-def _root(begin: np.ndarray, end: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Where the line between two gaps is 0: between them, or up to as far before, as where it rises below 0."""
-    fall = low - high
-    is_line = (fall > 0) | ((fall < 0) & (high > 0))
-    part = np.where(is_line, low / np.where(is_line, fall, 1), -1)
-    return begin + np.clip(part, -1, 1) * (end - begin)
+def _line(ends: tuple, gaps: tuple) -> tuple[np.ndarray, np.ndarray]:
+    """(m,) r where the line between the gaps at two ends is 0, 0 to 1, and how far that is beside them, in their
+    distance; far beside where it does not fall.
+
+    Counted from the end, as that is where precision is needed: close to a probe all that it sees is close to r = 0.
+    """
+    fall, length = gaps[0] - gaps[1], ends[0] - ends[1]
+    part = np.where(fall > 0, -gaps[1] / np.where(fall > 0, fall, 1), -1)
+    aside = np.maximum(np.maximum(-part, part - 1), 0)
+    return np.clip(ends[1] + np.clip(part, -ASIDE, 1 + ASIDE) * length, 0, 1), aside
