@@ -1,9 +1,9 @@
 """Captures reflection probes: maps of radiance with as many rays as their noise asks for, blurred level by level.
 
 Comes in: a scene, places. Goes out: `tree/probe_maps.py`'s record. Two halves of the rays of a texel are independent:
-their difference says how noisy a map is, and rays go on, twice as many each time, until that is little enough. Every
-level is blurred from the sharpest one (`prefilter.py`). A probe's maps depend on its place alone: not on its number,
-other probes, or threads.
+what sets them apart says how far off a map is, with bounced light shared between texels (`smoothing.py`) and without;
+the better one counts, and rays go on, twice as many each time, until that is good enough. Every level is blurred from
+the sharpest one (`prefilter.py`). Maps depend on a probe's place alone: not on its number, other probes, or threads.
 """
 
 from __future__ import annotations
@@ -15,13 +15,14 @@ import numpy as np
 
 from ..tree import octahedral, probe_maps
 from ..tree.probe_atlas import put
-from ..tree.probe_maps import ProbeMaps
+from ..tree.probe_maps import ProbeMaps, rounded
 from .gather import Effort
 from .lamps import LUMINANCE
 from .panorama import Panorama, Seen
 from .parallel import run_tiles, tiles
 from .prefilter import Prefilter, prefilter
 from .scene import Scene
+from .smoothing import alike, smoothed
 
 __all__ = ["PITCH", "Spending", "Studio", "capture", "shoot"]
 
@@ -34,8 +35,11 @@ FIRST_RAYS = 4
 HALVES = 2
 """Independent halves of a texel's rays."""
 
-LARGEST = np.float32(65504)
-"""Largest number of half precision."""
+FAINT = 2.0**-14
+"""Radiance below which half precision becomes coarse [W/(m2 sr)]: noise is relative to no less."""
+
+FARTHEST = np.float32(65504)
+"""Longest distance of half precision [m]; beyond, all is as far as the sky."""
 
 
 @dataclass(frozen=True)
@@ -158,8 +162,8 @@ def shoot(scene: Scene, studio: Studio, rows: np.ndarray, progress: Callable[[in
     Notes
     -----
     Error: noise as `Spending` says, where that takes no more than `most` rays; what a surface cache is off by, one
-    bounce on; radiance is rounded to half precision, by 2**-12 of it, and held at 65504. Tested against closed forms
-    and plain path tracing in `tests/bake/test_capture.py`.
+    bounce on; rounding (`probe_maps.rounded`). Tested against closed forms and plain path tracing in
+    `tests/bake/test_capture.py`.
     """
     size = studio.maps.layout.sizes[0]
 
@@ -167,41 +171,51 @@ def shoot(scene: Scene, studio: Studio, rows: np.ndarray, progress: Callable[[in
         for row in tile:
             place = studio.maps.position[row] - scene.origin
             around = Panorama(scene, place, size, studio.effort.bounces, studio.effort.seed)
-            _put_radiance(studio, row, _radiance(studio, row, around))
-            _put_surfaces(studio.maps, row, around.surfaces())
+            seen = around.surfaces()
+            _put_radiance(studio, row, _radiance(studio, row, around, alike(seen)))
+            _put_surfaces(studio.maps, row, seen)
         return len(tile)
 
     run_tiles(work, [rows[tile] for tile in tiles(len(rows), 1)], studio.effort.threads, progress)
 
 
-def _radiance(studio: Studio, row: int, around: Panorama) -> np.ndarray:
+def _radiance(studio: Studio, row: int, around: Panorama, weights: np.ndarray) -> np.ndarray:
     """(size * size, parts, 3) mean radiance of texels, by as many rays as it takes."""
     mixture = (studio.mixture * LUMINANCE).astype(np.float32)
     halves, count = [around.sums(half, 0, FIRST_RAYS) for half in range(HALVES)], FIRST_RAYS
     while True:
-        noise = _noise(*(np.einsum("tpc,pc->t", half, mixture) / count for half in halves))
-        if noise <= studio.spending.error or 2 * HALVES * count > studio.spending.most:
+        means = [half.over(count) for half in halves]
+        plain, smooth = [mean.straight + mean.bounced for mean in means], [smoothed(mean, weights) for mean in means]
+        errors = _errors(*(np.einsum("htpc,pc->ht", np.stack(pair), mixture) for pair in (plain, smooth)))
+        if min(errors) <= studio.spending.error or 2 * HALVES * count > studio.spending.most:
             break
-        halves = [total + around.sums(half, count, count) for half, total in enumerate(halves)]
+        halves = [total.plus(around.sums(half, count, count)) for half, total in enumerate(halves)]
         count *= 2
-    studio.rays[row], studio.noise[row] = HALVES * count, noise
-    return sum(halves) / np.float32(HALVES * count)
+    studio.rays[row], studio.noise[row] = HALVES * count, min(errors)
+    better = plain if errors[0] <= errors[1] else smooth
+    return sum(better) / np.float32(HALVES)
 
 
-def _noise(first: np.ndarray, second: np.ndarray) -> float:
-    """Standard error of the mean of two maps (size * size,), over each texel's light plus the map's mean."""
-    area = octahedral.solid_angles(round(len(first) ** 0.5)).reshape(-1) / (4 * np.pi)
-    light = np.abs(first + second) / 2
-    scale = light + (area * light).sum()
-    off = np.divide(first - second, 2 * scale, out=np.zeros_like(scale), where=scale > 0)
-    return float(np.sqrt((area * off**2).sum()))
+def _errors(plain: np.ndarray, smooth: np.ndarray) -> tuple[float, float]:
+    """Standard errors of the means of both halves (2, n), of a map as it is and smoothed: root mean square over all
+    directions, each over the texel's light plus the map's mean.
+
+    What a smoothed half and the other plain one differ by is noise of both, and what smoothing is off by.
+    """
+    area = octahedral.solid_angles(round(plain.shape[1] ** 0.5)).reshape(-1) / (4 * np.pi)
+    light = np.abs(smooth.sum(axis=0, dtype=np.float64)) / 2
+    share = area / (light + (area * light).sum() + FAINT) ** 2
+    noise, left = ((share * (pair[0] - pair[1]) ** 2).sum() / 4 for pair in (plain, smooth))
+    both = sum((share * (smooth[half] - plain[1 - half]) ** 2).sum() for half in range(HALVES)) / 2
+    bias = max(both - 2 * noise - 2 * left, 0.0)
+    return float(np.sqrt(noise)), float(np.sqrt(left + bias))
 
 
 def _put_radiance(studio: Studio, row: int, light: np.ndarray) -> None:
     """Blur a probe's maps and write all levels."""
     maps, size = studio.maps, studio.blur.size
     for level, image in enumerate(studio.blur(light.reshape(size, size, -1))):
-        image = np.clip(image, -LARGEST, LARGEST).astype(np.float16)
+        image = rounded(image)
         for part, atlases in enumerate(maps.radiance.values()):
             put(atlases[level], maps.layout, level, row, image[:, :, 3 * part : 3 * part + 3])
 
@@ -209,7 +223,7 @@ def _put_radiance(studio: Studio, row: int, light: np.ndarray) -> None:
 def _put_surfaces(maps: ProbeMaps, row: int, seen: Seen) -> None:
     """Write what lies behind a probe's texels."""
     size = maps.layout.sizes[0]
-    distance = np.where(seen.distance > LARGEST, np.float32(np.inf), seen.distance)
+    distance = np.where(seen.distance > FARTHEST, np.float32(np.inf), seen.distance)
     put(maps.distance, maps.layout, 0, row, distance.reshape(size, size).astype(np.float16))
     put(maps.normal, maps.layout, 0, row, seen.normal.T.reshape(size, size, 3).astype(np.float16))
-    put(maps.albedo, maps.layout, 0, row, seen.albedo.T.reshape(size, size, 3).astype(np.float16))
+    put(maps.albedo, maps.layout, 0, row, rounded(np.ascontiguousarray(seen.albedo.T)).reshape(size, size, 3))

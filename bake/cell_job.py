@@ -133,13 +133,13 @@ class Work:
         Scene
             With a cache around the cell; a scene no larger than a cell has the same for all.
         """
-        bounds, effort = self.scene.soup.bounds, self.target.effort
-        if np.ptp(bounds[:, :2], axis=0).max() > self.grid.cell_size:
+        effort = self.target.effort
+        if not radiosity.is_shared(self.scene, self.grid):
             dense = voxels.dense * self.grid.first_size
             return radiosity.around(self.scene, self.grid, dense, effort, lambda share: show(CACHED * share))
         with held(self.lock):
             if not self.shared:
-                box = np.stack([bounds[0], np.nextafter(bounds[1], np.inf)])
+                box = radiosity.whole(self.scene)
                 found = radiosity.around(self.scene, self.grid, box, effort, lambda share: show(CACHED * share))
                 self.shared.append(found)
             return self.shared[0]

@@ -21,9 +21,11 @@ import numpy as np
 
 from ..tree import container, verify, world
 from ..tree.topology import MAX_POINTS
-from . import job, reference, snapshot_file, viewpoint
+from . import job, probe_job, reference, snapshot_file, viewpoint
 from .arrays import check_output, one_line, read_points, write_array
+from .capture import Spending
 from .place import SNAPSHOT_NAME, check_target, scene_defects
+from .probe_job import Wish
 from .progress import Progress
 from .settings import (
     QUALITIES,
@@ -207,6 +209,10 @@ def _add_bake(commands) -> None:
     command.add_argument("--incremental", action="store_true", help=text)
     text = "refine cells, those near the camera first, for about this long; each has a coarse look at least"
     command.add_argument("--minutes", type=_minutes, default=0.0, help=text)
+    text = "reflection probes: auto where surfaces are glossy, N of them, or none"
+    command.add_argument("--probes", type=_probes, default="auto", metavar="auto|N|none", help=text)
+    text = f"most that they take as textures, in millions of bytes; auto takes {probe_job.AUTOMATIC:g}"
+    command.add_argument("--probe-megabytes", type=_megabytes, metavar="MB", help=text)
     _add_light(command)
 
 
@@ -263,9 +269,19 @@ def _run_bake(options, extract: Extract, progress: Progress) -> dict:
         raise SettingsError("--minutes and --incremental: one or the other, as only whole cells can be remembered")
     check_target(options.output)
     snapshot = _read_scene(options.scene, extract, progress)
-    manner = job.Manner(options.threads, options.early, options.incremental, 60 * options.minutes)
+    wish = _wish(options.probes, options.probe_megabytes, probe_job.spending_of(settings))
+    manner = job.Manner(options.threads, options.early, options.incremental, 60 * options.minutes, wish)
     outcome = job.bake(snapshot, options.output, settings, options.cells, manner, progress)
     return dataclasses.asdict(outcome)
+
+
+def _wish(probes: str | int, megabytes: float | None, spending: Spending) -> Wish | None:
+    """Which reflection probes were asked for."""
+    if probes == "none":
+        return None
+    if probes == "auto":
+        return Wish(megabytes=megabytes or probe_job.AUTOMATIC, spending=spending, only_if_glossy=True)
+    return Wish(probes, megabytes, least_gain=0.0, spending=spending)
 
 
 def _settings(options, samples: int, bounces: int, finest: float = 0.0) -> Settings:
@@ -370,12 +386,20 @@ def _show_bake(result: dict) -> str:
             f"{item['what']}: the surface cache is {bias} off on average, as paths show at {item['places']} places; a "
             f"data point's noise is {100 * item['noise']:.1f} %, before the fit to surfaces averages it out"
         )
+    if result["probes"]:
+        lines.append(_say_probes(result["probes"], result["bytes"]["probes"]))
     if result["kept"]:
         lines.append(f"kept as they were measured before: {result['kept']} data points")
     lines += [f"left out: {item['what']}: {item['why']}" for item in result["left_out"]]
     lines += [f"warning: {text}" for text in result["warnings"]]
     lines.append(f"written to {result['folder']}")
     return "\n".join(lines)
+
+
+def _say_probes(probes: dict, size: int) -> str:
+    """How many, how large, how good."""
+    good = f", {probes['rays']:.0f} rays a texel, noise {100 * probes['noise']:.1f} %" if probes["rays"] else ""
+    return f"{probes['count']} reflection probes, {size / 1e6:.2f} MB{good}"
 
 
 def _show_info(result: dict) -> str:
@@ -424,6 +448,16 @@ def _bytes(text: str) -> int:
     return int(value)
 
 
+def _probes(text: str) -> str | int:
+    """How many reflection probes."""
+    return text if text in ("auto", "none") else _whole(text, 0)
+
+
+def _megabytes(text: str) -> float:
+    """A size, more than none."""
+    return _above_none(text, "of megabytes")
+
+
 def _error(text: str) -> float:
     """A relative error, 0 to 1."""
     try:
@@ -437,12 +471,17 @@ def _error(text: str) -> float:
 
 def _minutes(text: str) -> float:
     """A time, more than none."""
+    return _above_none(text, "of minutes")
+
+
+def _above_none(text: str, of_what: str) -> float:
+    """A number above 0."""
     try:
         value = float(text)
     except ValueError:
         value = 0.0
     if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of minutes above 0")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number {of_what} above 0")
     return value
 
 

@@ -19,14 +19,16 @@ import numpy as np
 
 from ..tree import build, folder
 from ..tree.grid import FIRST_SIZE, Grid
+from ..tree.probe_file import PROBES
 from ..tree.topology import Topology
-from . import changes, memory, snapshot_file, summary
+from . import changes, memory, probe_job, snapshot_file, summary
 from .cell_job import History, Work, bake_cell, list_of, look_early
 from .check import Check
 from .deadline import Deadline
 from .gather import Effort
 from .parallel import CancelledError, Room, run_jobs
 from .place import Place, check_target
+from .probe_job import Made, Wish
 from .progress import Progress
 from .reference import sun_strength
 from .refine import Target
@@ -131,7 +133,8 @@ def bake(
         _forget(target, occupied)
     finally:
         listed = [entry for entry in place.close() if not entry.get("early") or tuple(entry["cell"]) in work.cut]
-    outcome = summary.describe(snapshot, settings, scene, trees)
+    probes, no_probes = _make_probes(work, manner.probes, len(occupied) - len(listed), progress)
+    outcome = summary.describe(snapshot, settings, scene, trees, no_probes)
     outcome.voxels = {"first": grid.first_size, "finest": float(grid.voxel_size(grid.levels - 1))}
     if not settings.finest and grid.first_size != FIRST_SIZE:
         outcome.warnings.append(
@@ -151,7 +154,9 @@ def bake(
     outcome.folder = str(target.absolute())
     outcome.seconds = progress.seconds
     outcome.rays = scene.tracer.rays
-    outcome.bytes = summary.file_sizes(listed)
+    outcome.bytes = summary.file_sizes(listed) | {"probes": probes.bytes}
+    if not no_probes:
+        outcome.probes = {"count": probes.count, "rays": probes.rays, "noise": probes.noise}
     return outcome
 
 
@@ -191,12 +196,14 @@ class Manner:
         since an earlier bake of the folder kept it
     seconds : float, time after which cells are not refined any further [s], 0 for no limit; all cells have an early
         look before. Not together with `incremental`
+    probes : Wish, which reflection probes to make once all cells are there; None for none
     """
 
     threads: int = 0
     early: bool = False
     incremental: bool = False
     seconds: float = 0.0
+    probes: Wish | None = None
 
 
 def _rules(settings: Settings, scene: Scene, grid: Grid) -> str:
@@ -294,6 +301,28 @@ def _bake_cells(work: Work, cells: list[tuple[int, int]], progress: Progress) ->
         return _Counts.of(tree, cell in work.cut)
 
     return run_jobs(bake_one, len(cells), work.target.effort.threads)
+
+
+def _make_probes(work: Work, wish: Wish | None, missing: int, progress: Progress) -> tuple[Made, str]:
+    """Reflection probes, or why there are none; older ones go then."""
+    settings, target = work.settings, work.place.target
+    effort = Effort(0, settings.bounces, settings.seed, work.target.effort.threads)
+    job = probe_job.Job(
+        work.scene, work.grid, target, work.judge.mean, wish or Wish(), effort, settings.method == "cache"
+    )
+    if wish is None:
+        why = "none were asked for"
+    elif missing:
+        why = f"{missing} of the scene's cells are not baked yet, and probes look at all of them"
+    else:
+        why = "the time was too short" if not work.deadline.left else probe_job.why_none(job)
+    if not why:
+        progress.stage("Probes", STEPS)
+        return probe_job.run(job, lambda share: progress.show(int(share * STEPS))), ""
+    if (target / PROBES).exists() and missing == 0:
+        (target / PROBES).unlink()
+        folder.list_again(target)
+    return Made(0, 0), why
 
 
 def _forget(target: Path, occupied: list[tuple[int, int]]) -> None:

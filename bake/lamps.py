@@ -186,6 +186,31 @@ class Lamps:
         is_area = self._kind[lamp] > LightKind.SPOT
         return np.where(is_area, np.maximum(cosine, 0) * np.float32(1 / np.pi), within)
 
+    def along(self, lamp: int, origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Look at a lamp's shape.
+
+        Parameters
+        ----------
+        lamp : int
+            Which one; those of no size are never met.
+        origin : (3, n) float32 ndarray
+            Where rays start [m].
+        direction : (3, n) float32 ndarray
+            Unit vectors.
+
+        Returns
+        -------
+        distance : (n,) float32 ndarray
+            To the shape [m]; 0 for rays that miss it.
+        radiance : (3, n) float32 ndarray
+            What it sends back; its integral is the irradiance of `shine` [W/(m2 sr)].
+        """
+        center = self._position[:, lamp, None] - origin
+        is_round = self._kind[lamp] <= LightKind.SPOT
+        distance, shines = (self._to_disk if is_round else self._to_area)(lamp, center, direction)
+        distance = np.where(shines > 0, distance, np.float32(0))
+        return distance, self._strength[:, lamp, None] * shines
+
     @property
     def power(self) -> np.ndarray:
         """(k,) emitted luminance of each lamp [W]."""
@@ -255,6 +280,32 @@ class Lamps:
         squared = np.maximum(warp.dot(toward, toward), self._nearest**2)
         facing = warp.dot(toward, axis) / np.sqrt(squared)
         return toward, wider * np.maximum(facing, 0) / squared * self._cone(lamp, axis)
+
+    def _to_disk(self, lamp: int, center: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Distances to the disk of `_evaluate_round`, and its radiance over the lamp's intensity."""
+        radius, is_sphere = self._size[:, lamp]
+        apart = np.maximum(np.sqrt(warp.dot(center, center)), self._nearest)
+        axis = center / apart
+        facing = np.maximum(warp.dot(direction, axis), np.float32(1e-6))
+        distance = apart / facing
+        wider = 1 / np.maximum(1 - (radius / apart) ** 2, INSIDE) if is_sphere else np.float32(1)
+        hit = apart**2 * (1 / facing**2 - 1) <= radius**2 * wider
+        area = np.float32(np.pi) * np.maximum(radius, self._nearest) ** 2
+        return distance, np.where(hit & (radius > 0), self._cone(np.array([lamp]), axis) / area, np.float32(0))
+
+    def _to_area(self, lamp: int, center: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Distances to a rectangle or an ellipse, and 1 where its shining side is met."""
+        before, facing = (warp.dot(part, self._z[:, lamp, None]) for part in (center, direction))
+        shines = (before > 0) & (facing > np.float32(1e-6))
+        distance = np.divide(before, facing, out=np.zeros_like(before), where=shines)
+        at = direction * distance - center
+        x, y = (warp.dot(at, axis[:, lamp, None]) for axis in (self._x, self._y))
+        width, height = self._size[:, lamp] / 2
+        if self._kind[lamp] == LightKind.ELLIPSE:
+            within = (x / width) ** 2 + (y / height) ** 2 <= 1
+        else:
+            within = (np.abs(x) <= width) & (np.abs(y) <= height)
+        return distance, (shines & within).astype(np.float32)
 
     def _cone(self, lamp: np.ndarray, axis: np.ndarray) -> np.ndarray:
         """Blender's spot: a smooth step in the cosine, over the blend."""

@@ -221,6 +221,36 @@ def trace(scene: Scene, wave: Wave, numbers: Numbers, bounces: int) -> Radiance:
     return light
 
 
+def look(scene: Scene, wave: Wave, numbers: Numbers) -> tuple[Radiance, np.ndarray, Vertex]:
+    """See what rays end on.
+
+    Parameters
+    ----------
+    scene : Scene
+        What they travel through.
+    wave : Wave
+        One path for each ray, `lane` counting from 0, `beta` 1, `pdf` `CERTAIN` where they were not drawn by chance;
+        used up.
+    numbers : Numbers
+        Their random numbers.
+
+    Returns
+    -------
+    light : Radiance
+        The sky, and what surfaces emit.
+    lane : (m,) int64 ndarray
+        Rays that meet a surface.
+    vertex : Vertex
+        Where they do, with the reflectance that they see there.
+    """
+    light = Radiance.zeros(scene, len(wave.lane))
+    wave, hits, travelled = _advance(scene, wave, numbers, 0, light)
+    _add_emission(scene, wave, hits, travelled, light)
+    vertex = _arrive(scene, wave, hits, travelled)
+    vertex.reflectance = vertex.reflectance * wave.beta
+    return light, wave.lane, vertex
+
+
 def shine(scene: Scene, vertex: Vertex, numbers: Numbers) -> tuple[Radiance, np.ndarray]:
     """Direct light on surfaces, of all that can be looked for there; emitters and a sky that paths find by chance
     are weighed against that.
@@ -250,7 +280,7 @@ def shine(scene: Scene, vertex: Vertex, numbers: Numbers) -> tuple[Radiance, np.
     return light, of_lamps
 
 
-def arriving(scene: Scene, vertex: Vertex, numbers: Numbers, bounces: int, cache: Cache) -> Radiance:
+def arriving(scene: Scene, vertex: Vertex, numbers: Numbers, bounces: int, cache: Cache | None) -> Radiance:
     """Light that paths from surfaces find by chance: all but what `shine` looks for.
 
     Parameters
@@ -263,7 +293,7 @@ def arriving(scene: Scene, vertex: Vertex, numbers: Numbers, bounces: int, cache
         Their random numbers.
     bounces : int
         Reflections on the way, the points' own among them.
-    cache : Cache
+    cache : Cache, optional
         What ends paths.
 
     Returns

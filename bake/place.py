@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..tree import container, folder
+from ..tree import container, folder, probe_file
 from ..tree.planes import CellPlanes
 from ..tree.topology import Topology
 from ..tree.verify import Defect
@@ -332,10 +332,13 @@ def _bake_in(target: Path) -> str | None:
 
 
 def _remove_other_bakes(target: Path, identity: str, listed: set[str]) -> None:
-    """Remove the files of cells that this bake did not write; only those that it does not list are read."""
+    """Remove the files of cells and probes that this bake did not write; of cells only those that it does not list
+    are read."""
     for path in folder.files(target):
         if path.name.startswith("cell_") and path.name not in listed and not _belongs(path, identity):
             path.unlink(missing_ok=True)
+    if (probe_file.describe(target) or {}).get("bake", identity) != identity:
+        (target / probe_file.PROBES).unlink(missing_ok=True)
 
 
 def _belongs(path: Path, identity: str) -> bool:

@@ -16,6 +16,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ..tree.grid import Grid
+from ..tree.topology import Topology
 from . import paths, receivers
 from .discovery import Places, Spending, find, numbers, vertex
 from .gather import Effort
@@ -29,7 +30,7 @@ from .scene import Scene
 from .sobol import scramble
 from .surfels import NONE, Known, Lattice, Surfels, Table, reflected
 
-__all__ = ["around", "cached"]
+__all__ = ["around", "cached", "is_shared", "of_cell", "whole"]
 
 FOUND = 0.3
 """Part of the progress that finding surfels takes."""
@@ -135,6 +136,59 @@ def around(
     low, high = np.maximum(box[0], scene.soup.bounds[0]), np.minimum(box[1], scene.soup.bounds[1])
     lattice = Lattice(low.astype(np.float32), high.astype(np.float32), grid.first_size / CUBES)
     return cached(scene, at, lattice, effort, Spending(), progress)
+
+
+def is_shared(scene: Scene, grid: Grid) -> bool:
+    """Say whether all cells of a scene have the same surface cache.
+
+    Parameters
+    ----------
+    scene : Scene
+        Its surfaces.
+    grid : Grid
+        The lattice of the bake.
+
+    Returns
+    -------
+    bool
+        Whether it is no larger than a cell.
+    """
+    return bool(np.ptp(scene.soup.bounds[:, :2], axis=0).max() <= grid.cell_size)
+
+
+def whole(scene: Scene) -> np.ndarray:
+    """Box of a surface cache that all cells share.
+
+    Parameters
+    ----------
+    scene : Scene
+        Its surfaces.
+
+    Returns
+    -------
+    (2, 3) float64 ndarray
+        As `around` takes it.
+    """
+    return np.stack([scene.soup.bounds[0], np.nextafter(scene.soup.bounds[1], np.inf)])
+
+
+def of_cell(grid: Grid, tree: Topology) -> np.ndarray:
+    """Box of the surface cache of a single cell.
+
+    Parameters
+    ----------
+    grid : Grid
+        The lattice of the bake.
+    tree : Topology
+        The cell.
+
+    Returns
+    -------
+    (2, 3) float64 ndarray
+        As `around` takes it.
+    """
+    low = np.array(tree.grid_min)
+    return np.stack([low, low + tree.grid_shape]) * grid.first_size
 
 
 class _Recorder:

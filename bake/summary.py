@@ -40,6 +40,7 @@ class Outcome:
     modelled: list[str] = field(default_factory=list)
     left_out: list[dict[str, str]] = field(default_factory=list)
     checked: list[dict] = field(default_factory=list)
+    probes: dict[str, float] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
 
 
@@ -101,7 +102,7 @@ def _sun_header(snapshot: Snapshot, settings: Settings, light: Model) -> dict:
     }
 
 
-def describe(snapshot: Snapshot, settings: Settings, scene: Scene, trees: list) -> Outcome:
+def describe(snapshot: Snapshot, settings: Settings, scene: Scene, trees: list, no_probes: str) -> Outcome:
     """Count, and say what was modelled and what was left out and why.
 
     Parameters
@@ -114,6 +115,8 @@ def describe(snapshot: Snapshot, settings: Settings, scene: Scene, trees: list) 
         The same scene, prepared.
     trees : list
         Of each cell `size`, `dilated` and `left_out`.
+    no_probes : str
+        Why there are no reflection probes; empty where there are.
 
     Returns
     -------
@@ -127,7 +130,7 @@ def describe(snapshot: Snapshot, settings: Settings, scene: Scene, trees: list) 
         "local": (scene.has_local, "the scene has no lamps and no emissive surfaces"),
         "sun": (len(light.suns.toward) > 0, "there is no sun, or none was asked for"),
         "sky": (light.sky != "none", "the sky is black"),
-        "probes": (False, "specular probes are not baked by this version"),
+        "probes": (not no_probes, no_probes),
     }
     for name, (present, why) in parts.items():
         if present:

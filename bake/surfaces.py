@@ -120,6 +120,29 @@ class Surfaces:
         """
         return self._evaluate("emission", self._lanes(triangle, u, v))
 
+    def gloss(self, triangle: np.ndarray, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What decides how sharp reflections are.
+
+        Parameters
+        ----------
+        triangle : (n,) int ndarray
+            Hits.
+        u, v : (n,) float32 ndarray
+            Their barycentric coordinates.
+
+        Returns
+        -------
+        roughness : (n,) float32 ndarray
+            Principled's, 0 to 1.
+        smooth : (n,) float32 ndarray
+            Share of light that a surface as it is would reflect if it were smooth: of metal all, of a dielectric what
+            its layer does.
+        """
+        lanes = self._lanes(triangle, u, v)
+        metallic = np.minimum(self._evaluate("metallic", lanes)[0], 1)
+        layer = self._shares[lanes.material, 0]
+        return np.minimum(self._evaluate("roughness", lanes)[0], 1), metallic + (1 - metallic) * layer
+
     def _lanes(self, triangle: np.ndarray, u: np.ndarray, v: np.ndarray) -> _Lanes:
         """Hits, with what their channels share."""
         return _Lanes(self.material[triangle], triangle, u, v, self._uvs, self._colors)

@@ -1,8 +1,8 @@
 """The folder of a bake: the files of its world cells, and one `world.json` that lists them.
 
 Comes in: finished cells, in any order and from any process. Goes out: `world.json` with format, grid, bounds,
-transports, the cells with the SHA-256 of each file, and a checksum of its own. Written atomically from whatever
-cells belong to the bake, so that a bake can stop at any moment.
+transports, the cells and the probes with the SHA-256 of each file, and a checksum of its own. Written atomically from
+whatever belongs to the bake, so that a bake can stop at any moment.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from .cells import (
 )
 from .container import FileError
 from .grid import Grid
+from .probe_file import PROBES, describe
 from .topology import Topology
 
 __all__ = [
@@ -43,6 +44,7 @@ __all__ = [
     "files",
     "grid_of",
     "has_cell",
+    "list_again",
     "load_header",
     "read_cell",
     "write_cell",
@@ -57,7 +59,7 @@ FILE_NAME = re.compile(r"cell_(-?\d+)_(-?\d+)\.(tree|points|local|sun|sky)")
 
 
 def assemble(folder: str | os.PathLike, header: dict) -> dict:
-    """Write `world.json` from the cells that belong to a bake.
+    """Write `world.json` from the cells and probes that belong to a bake.
 
     Processes that bake other cells into the folder may do the same at the same time: whoever writes last looks
     again afterwards, and so lists all cells.
@@ -92,10 +94,35 @@ def assemble(folder: str | os.PathLike, header: dict) -> dict:
     lattice = dataclasses.asdict(grid) | {"cell_size": grid.cell_size, "unit": "m"}
     content = header | {"format": WORLD_FORMAT, "version": WORLD_VERSION, "grid": lattice, "cells": cells}
     content["bounds"] = _bounds([entry["bounds"] for entry in cells])
+    probes = describe(folder) or {}
+    content.pop("probes", None)
+    content |= {"probes": probes} if probes.get("bake") == header["bake"] else {}
     content = json.loads(json.dumps(content, allow_nan=False))
     content["checksum"] = _checksum(content)
     write_bytes_atomically(Path(folder) / WORLD, _to_text(content))
     return content
+
+
+def list_again(folder: str | os.PathLike) -> dict:
+    """Write `world.json` anew: it lists what has come and gone since.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Folder of a bake.
+
+    Returns
+    -------
+    dict
+        What `load_header` will return.
+
+    Raises
+    ------
+    FileError, OSError
+        When it cannot be read, or written.
+    """
+    header = load_header(folder)
+    return assemble(folder, header | {"grid": grid_of(header)})
 
 
 def load_header(folder: str | os.PathLike) -> dict:
@@ -170,7 +197,7 @@ def files(folder: str | os.PathLike) -> list[Path]:
     Returns
     -------
     list of Path
-        `world.json`, the snapshot `scene.giv` and the cells' files, sorted.
+        `world.json`, the snapshot `scene.giv`, the cells' files and the probes', sorted.
 
     Raises
     ------
@@ -187,7 +214,7 @@ def _is_ours(name: str) -> bool:
     """Whether a bake writes files of this name; temporary ones carry the name they will get."""
     temporary = re.fullmatch(r"\.(.+)\.[0-9a-f]{32}\.tmp", name)
     name = temporary[1] if temporary else name
-    return name in (WORLD, "scene.giv") or FILE_NAME.fullmatch(name) is not None
+    return name in (WORLD, "scene.giv", PROBES) or FILE_NAME.fullmatch(name) is not None
 
 
 def _cells_in(folder: str | os.PathLike) -> list[tuple[int, int]]:

@@ -16,7 +16,14 @@ import numpy as np
 
 from .probe_atlas import Layout
 
-__all__ = ["ProbeMaps", "empty", "part_names"]
+__all__ = ["LARGEST", "ProbeMaps", "empty", "part_names", "rounded"]
+
+LARGEST = np.float32(65408)
+"""Largest number that half precision holds in nine binary digits."""
+
+DROPPED = 15
+"""Binary digits of single precision that are rounded away: nine are left, the first of them not stored. Noise is some
+ten times as much, and files are a sixth smaller than with all eleven of half precision."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,10 +34,10 @@ class ProbeMaps:
     position : (k, 3) float64 [m], world coordinates
     pinned : (k,) bool, whether an artist put them there
     radiance : dict of str to tuple of (rows_l, columns_l, 3) float16, of each part by mip level [W/(m2 sr), or as the
-        part says]; `ggx.ladder` gives the levels' roughness
+        part says], `rounded`; `ggx.ladder` gives the levels' roughness
     distance : (rows, columns) float16 [m], to what the middle of each texel of level 0 sees; inf is the sky
     normal : (rows, columns, 3) float16, of that surface's side, unit length; 0 is the sky
-    albedo : (rows, columns, 3) float16, its diffuse reflectance, 0 to 1; 0 is the sky
+    albedo : (rows, columns, 3) float16, its diffuse reflectance, 0 to 1, `rounded`; 0 is the sky
     """
 
     layout: Layout
@@ -40,6 +47,34 @@ class ProbeMaps:
     distance: np.ndarray
     normal: np.ndarray
     albedo: np.ndarray
+
+
+def rounded(values: np.ndarray) -> np.ndarray:
+    """Round to what is worth storing of radiance and albedo.
+
+    Parameters
+    ----------
+    values : float32 ndarray
+        Finite numbers.
+
+    Returns
+    -------
+    float16 ndarray
+        Of nine binary digits, held at `LARGEST`.
+
+    Notes
+    -----
+    Error: 2**-9 of each number, 0.2 %; below 6e-5 up to 3e-8.
+
+    Examples
+    --------
+    >>> rounded(np.float32([1, 1.0015, 1.0025, 1e6]))
+    array([1.000e+00, 1.000e+00, 1.004e+00, 6.541e+04], dtype=float16)
+    """
+    bits = np.clip(values, -LARGEST, LARGEST).view(np.uint32)
+    half = np.uint32((1 << DROPPED - 1) - 1) + (bits >> np.uint32(DROPPED) & np.uint32(1))  # ties go to even numbers
+    kept = bits + half & ~np.uint32((1 << DROPPED) - 1)
+    return kept.view(np.float32).astype(np.float16)
 
 
 def part_names(has_local: bool, suns: int, functions: int) -> tuple[str, ...]:

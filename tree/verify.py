@@ -1,4 +1,4 @@
-"""Checks a baked folder: every checksum, every hash, every invariant, every cell.
+"""Checks a baked folder: every checksum, every hash, every invariant, every cell, the probes.
 
 Comes in: a folder. Goes out: the list of all defects, each as a file and a sentence; empty for a sound bake.
 """
@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from . import folder
+from . import folder, probe_file
 from .cells import cell_path, describe_file
 from .container import FileError
 
@@ -62,7 +62,7 @@ def verify(path: str | os.PathLike) -> list[Defect]:
 
 
 def _defects(path: Path, header: dict) -> Iterator[Defect]:
-    """Cell by cell, then what should be there and is not."""
+    """Cell by cell, then what should be there and is not, then the probes."""
     listed = {tuple(entry["cell"]) for entry in header["cells"]}
     for entry in header["cells"]:
         yield from _cell_defects(path, entry, header["bake"])
@@ -72,6 +72,10 @@ def _defects(path: Path, header: dict) -> Iterator[Defect]:
     for cell in header.get("expected_cells", []):
         if tuple(cell) not in listed:
             yield Defect(cell_path(path, cell, "tree").name, f"cell {cell[0]},{cell[1]} is missing: not baked yet")
+    try:
+        probe_file.load(path, header)
+    except (OSError, FileError) as error:
+        yield Defect(probe_file.PROBES, _reason(error))
 
 
 def _cell_defects(path: Path, entry: dict, bake: str) -> Iterator[Defect]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import build_scenes
 import numpy as np
 import pytest
+from gi_volumes.bake import warp
 from gi_volumes.bake.gather import Effort, gather
 from gi_volumes.bake.lamps import NEAREST, Lamps
 from gi_volumes.bake.scene import Model, prepare
@@ -193,3 +194,40 @@ def test_a_scene_a_tenth_of_a_millimetre_wide_is_lit_like_the_same_scene_a_metre
         for lights, size in ((large, 1.0), (small, scale))
     ]
     assert found[1] * scale**2 == pytest.approx(found[0], rel=1e-5)
+
+
+SHAPES = {
+    "soft point": {"size": (0.5, 0)},
+    "sphere": {"size": (0.5, 1)},
+    "spot": {
+        "kind": LightKind.SPOT,
+        "size": (0.4, 0),
+        "spot": (0.7, 0.6),
+        "frame": build_scenes.sun_frame((0.3, 0.1, 1)),
+    },
+    "rectangle": {"kind": LightKind.RECTANGLE, "size": (1.0, 2.0), "frame": build_scenes.sun_frame((0.2, -0.3, 1))},
+    "ellipse": {"kind": LightKind.ELLIPSE, "size": (2.0, 0.8), "frame": build_scenes.sun_frame((-0.4, 0.2, 1))},
+}
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_rays_that_meet_a_lamp_bring_the_light_that_it_is_sampled_for(shape):
+    lamps = made(SHAPES[shape] | {"position": (0.4, 0.3, 1.6), "strength": (3, 2, 1)})
+    truth = on_surface(lamps, (0, 0, 0), (0, 0, 1))
+    direction = warp.cosine(*uniform(4 * SAMPLES)[:2], np.repeat(columns((0, 0, 1)), 4 * SAMPLES, axis=1))
+    distance, radiance = lamps.along(0, np.zeros_like(direction), direction)
+    found = np.pi * radiance.T.astype(float)
+    assert ((distance > 0) == (radiance[0] > 0)).all()
+    noise = np.hypot(standard_error(truth), standard_error(found))
+    assert (np.abs(found.mean(axis=0) - truth.mean(axis=0)) < STANDARD_ERRORS * noise + 1e-4).all()
+    assert (np.abs(1.05 * found.mean(axis=0) - truth.mean(axis=0)) > STANDARD_ERRORS * noise).all()
+    assert distance[distance > 0].min() > 0.7
+
+
+def test_lamps_of_no_size_and_backs_of_area_lamps_are_not_met():
+    up = columns((0, 0, 1))
+    point = {"position": (0, 0, 1.0)}
+    back = {"kind": LightKind.RECTANGLE, "position": (0, 0, 1.0), "size": (1, 1), "frame": np.diag([1.0, -1.0, -1.0])}
+    front = back | {"frame": np.eye(3)}
+    for lamp, met in ((point, 0), (back, 0), (front, 1)):
+        assert made(lamp).along(0, np.zeros_like(up), up)[0].tolist() == [met]

@@ -1,0 +1,256 @@
+"""A bake's probes: made once, kept when valid, whole or not at all, by the surface cache of each cell."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import shutil
+from pathlib import Path
+
+import build_scenes
+import numpy as np
+import pytest
+from command_line import QUICK, call, stored, succeed
+from gi_volumes.bake import cli, probe_job, radiosity
+from gi_volumes.bake.capture import Spending
+from gi_volumes.bake.gather import Effort
+from gi_volumes.bake.job import Manner, bake
+from gi_volumes.bake.parallel import CancelledError
+from gi_volumes.bake.probe_job import Job, Made, Wish, probe_bytes, run
+from gi_volumes.bake.probes import RequestError
+from gi_volumes.bake.scene import prepare
+from gi_volumes.bake.settings import Settings, model
+from gi_volumes.bake.snapshot import Channel, Material, Snapshot
+from gi_volumes.tree import folder, probe_file
+from gi_volumes.tree.verify import verify
+
+SETTINGS = Settings(samples=2, bounces=3, error=0.0, finest=2.0, sky="0.5,0.6,0.9")
+SPENDING = Spending(error=0.5, most=8, pitch=16)
+ORIGIN = np.array([1024.0, -2048.0, 0.0])
+
+
+def at(*place: float) -> np.ndarray:
+    """World coordinates of a place in the hall."""
+    return ORIGIN + np.array(place)
+
+
+def hall(*rooms: float) -> Snapshot:
+    """Rooms of 10 x 8 x 4 m, each with a lamp, open above; far from the world's origin."""
+    parts, lights = [], []
+    for x in rooms:
+        walls = build_scenes.box((x, 0.5, 0.1), (x + 10, 8.5, 4.1), inward=True)
+        parts.append((np.delete(walls, (2, 3), axis=0), Material("wall", Channel((0.7, 0.6, 0.5)))))
+        lights.append({"position": at(x + 3, 4, 3), "strength": (9, 9, 9)})
+    return build_scenes.snapshot(parts, build_scenes.lamps(*lights), origin=ORIGIN)
+
+
+def job_of(target: Path, snapshot: Snapshot, **changes) -> Job:
+    """What a bake in the folder leaves to be done."""
+    effective, light = model(snapshot, SETTINGS)
+    scene, grid = prepare(effective, light), folder.grid_of(folder.load_header(target))
+    wish, effort = Wish(3, spending=SPENDING), Effort(0, SETTINGS.bounces, 0, 1)
+    return dataclasses.replace(Job(scene, grid, target, np.ones((2, 3)), wish, effort, False), **changes)
+
+
+@pytest.fixture(scope="module")
+def baked(tmp_path_factory) -> Path:
+    target = tmp_path_factory.mktemp("hall")
+    bake(hall(0.2), target, SETTINGS)
+    return target
+
+
+@pytest.fixture
+def target(baked, tmp_path) -> Path:
+    """A bake to put probes into."""
+    return Path(shutil.copytree(baked, tmp_path / "bake"))
+
+
+def bytes_in(target: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in target.iterdir()}
+
+
+def test_probes_are_placed_captured_listed_and_found_sound(target):
+    made = run(job_of(target, hall(0.2)))
+    maps = probe_file.load(target, folder.load_header(target))
+    assert (made.count, made.kept, list(maps.radiance)) == (3, False, ["local", "sky"])
+    inside = (maps.position > at(0.2, 0.5, 0.1)) & (maps.position < at(10.2, 8.5, 8))
+    assert inside.all()
+    assert made.bytes == (target / "probes.exr").stat().st_size
+    assert made.noise <= 0.5
+    assert made.rays == 8
+    assert maps.radiance["local"][0].astype(float).mean() > 0.05
+    assert verify(target) == []
+
+
+def test_valid_probes_are_kept_and_others_made_anew(target):
+    job = job_of(target, hall(0.2))
+    first = run(job)
+    before = bytes_in(target)
+    stamp = (target / "probes.exr").stat().st_mtime_ns
+    assert run(job) == Made(3, first.bytes, kept=True)
+    assert bytes_in(target) == before
+    assert (target / "probes.exr").stat().st_mtime_ns == stamp
+    for changes in (
+        {"wish": dataclasses.replace(job.wish, count=2)},
+        {"wish": dataclasses.replace(job.wish, pinned=at(1, 2, 3)[None])},
+        {"effort": Effort(0, SETTINGS.bounces, 1, 1)},
+    ):
+        assert not run(dataclasses.replace(job, **changes)).kept
+        assert bytes_in(target)["probes.exr"] != before["probes.exr"]
+    assert verify(target) == []
+
+
+def test_a_damaged_file_is_made_again(target):
+    job = job_of(target, hall(0.2))
+    run(job)
+    before = bytes_in(target)
+    (target / "probes.exr").write_bytes(before["probes.exr"][:-1])
+    assert not run(job).kept
+    assert bytes_in(target) == before
+
+
+def test_any_number_of_threads_gives_the_same_file(target):
+    files = []
+    for threads in (1, 2, 3):
+        job = job_of(target, hall(0.2), effort=Effort(0, SETTINGS.bounces, 0, threads), cached=True)
+        (target / "probes.exr").unlink(missing_ok=True)
+        run(job)
+        files.append(bytes_in(target)["probes.exr"])
+    assert files[1:] == files[:1] * 2
+
+
+@pytest.mark.parametrize("share", [0.0, 0.05, 0.5])
+def test_work_that_is_stopped_leaves_the_folder_as_it_was(target, share):
+    before = bytes_in(target)
+    with pytest.raises(CancelledError):
+        run(job_of(target, hall(0.2)), lambda done: done < share)
+    assert bytes_in(target) == before
+
+
+def test_progress_rises_from_begin_to_end(target):
+    said = []
+    run(job_of(target, hall(0.2), cached=True), lambda share: said.append(share) or True)
+    assert said == sorted(said)
+    assert said[-1] == pytest.approx(1)
+
+
+def test_pinned_probes_stand_where_they_were_put_and_deleted_boxes_are_empty(target):
+    pinned = at(2, 3, 1.5)[None]
+    box = np.array([at(0, 0, 0), at(5, 9, 9)])
+    wish = Wish(4, spending=SPENDING, pinned=pinned, deleted=box[None])
+    run(job_of(target, hall(0.2), wish=wish))
+    maps = probe_file.load(target, folder.load_header(target))
+    assert maps.pinned.tolist() == [True, False, False, False]
+    assert maps.position[0] == pytest.approx(pinned[0])
+    assert (maps.position[1:, 0] > box[1, 0]).all()
+
+
+def test_no_probe_at_all_is_a_file_too(target):
+    made = run(job_of(target, hall(0.2), wish=Wish(0, spending=SPENDING)))
+    assert made.count == 0
+    assert len(probe_file.load(target, folder.load_header(target)).position) == 0
+    assert verify(target) == []
+
+
+def test_a_budget_counts_what_maps_take_in_memory(target):
+    size = probe_bytes(16, 2)
+    made = run(job_of(target, hall(0.2), wish=Wish(megabytes=2.5 * size / 1e6, spending=SPENDING)))
+    maps = probe_file.load(target, folder.load_header(target))
+    arrays = [level for part in maps.radiance.values() for level in part] + [maps.distance, maps.normal, maps.albedo]
+    assert (made.count, sum(array.nbytes for array in arrays)) == (2, 2 * size)
+
+
+def test_a_wish_without_sense_is_refused(target):
+    with pytest.raises(RequestError, match="probes"):
+        run(job_of(target, hall(0.2), wish=Wish(-1, spending=SPENDING)))
+    assert not (target / "probes.exr").exists()
+
+
+def test_another_bake_of_the_folder_removes_its_probes(target):
+    run(job_of(target, hall(0.2)))
+    bake(hall(0.2), target, dataclasses.replace(SETTINGS, seed=1))
+    assert not (target / "probes.exr").exists()
+    assert "probes" not in json.loads((target / "world.json").read_bytes())
+
+
+def test_the_same_bake_again_keeps_its_probes(target):
+    run(job_of(target, hall(0.2)))
+    before = bytes_in(target)
+    manner = Manner(threads=1, probes=job_of(target, hall(0.2)).wish)
+    assert bake(hall(0.2), target, SETTINGS, manner=manner).probes["count"] == 3
+    assert bytes_in(target) == before
+
+
+def test_a_large_scene_has_a_cache_for_each_cell(tmp_path, monkeypatch):
+    snapshot, boxes = hall(4.2, 134.2), []
+    bake(snapshot, tmp_path, SETTINGS)
+    monkeypatch.setattr(probe_job, "WORTH", 0)
+    around = radiosity.around
+    monkeypatch.setattr(radiosity, "around", lambda *a: boxes.append(a[2]) or around(*a))
+    outside = at(300, 0, 1)
+    run(job_of(tmp_path, snapshot, cached=True, wish=Wish(5, spending=SPENDING, pinned=outside[None])))
+    maps = probe_file.load(tmp_path, folder.load_header(tmp_path))
+    cells = np.unique(np.floor((maps.position[1:, 0] - ORIGIN[0]) / 128))
+    assert cells.tolist() == [0, 1]
+    assert sorted(box[0, 0] // 128 for box in boxes) == [0, 1]
+    assert maps.radiance["local"][0].astype(float).mean() > 0
+
+
+def mirrored() -> Snapshot:
+    """The hall with a mirror in it."""
+    snapshot = hall(0.2)
+    chrome = Material("chrome", metallic=Channel((1.0,)), roughness=Channel((0.1,)))
+    return dataclasses.replace(snapshot, materials=(*snapshot.materials[:-1], chrome))
+
+
+def made_by_command(snapshot: Snapshot, target: Path, *words: str) -> dict:
+    scene = stored(target, snapshot)
+    return succeed("bake", scene, "-o", target / "bake", *QUICK, *words)
+
+
+def test_the_command_makes_probes_where_surfaces_are_glossy(tmp_path, monkeypatch):
+    monkeypatch.setattr(cli.probe_job, "AUTOMATIC", probe_bytes(128, 1) * 1.5e-6)
+    said = made_by_command(mirrored(), tmp_path)
+    assert said["probes"]["count"] == 1
+    assert said["bytes"]["probes"] == (tmp_path / "bake/probes.exr").stat().st_size
+    assert "probes" in said["modelled"]
+    assert succeed("verify", tmp_path / "bake") == {"defects": []}
+    again = made_by_command(mirrored(), tmp_path)
+    assert again["probes"] == {"count": 1, "rays": 0.0, "noise": 0.0}
+    none = made_by_command(mirrored(), tmp_path, "--probes", "none")
+    assert "probes" not in none["modelled"]
+    assert {"what": "probes", "why": "none were asked for"} in none["left_out"]
+    assert not (tmp_path / "bake/probes.exr").exists()
+    assert succeed("verify", tmp_path / "bake") == {"defects": []}
+
+
+def test_the_command_says_why_a_dull_scene_has_none_and_makes_them_if_asked(tmp_path):
+    said = made_by_command(hall(0.2), tmp_path)
+    (why,) = [item["why"] for item in said["left_out"] if item["what"] == "probes"]
+    assert why.startswith("0.0 % of all surfaces are smoother than roughness 0.4; --probes N")
+    said = call("bake", tmp_path / "level.giv", "-o", tmp_path / "bake", *QUICK, "--probes", "1").out
+    assert re.search(r"^1 reflection probes, 0\.\d\d MB, \d+ rays a texel, noise \d+\.\d %$", said, re.MULTILINE)
+
+
+def test_some_cells_alone_have_no_probes_yet(tmp_path):
+    scene = stored(tmp_path, hall(4.2, 134.2))
+    words = ("bake", scene, "-o", tmp_path / "bake", *QUICK, "--probes", "1")
+    (why,) = [item["why"] for item in succeed(*words, "--cells", "0,0")["left_out"] if item["what"] == "probes"]
+    assert "of the scene's cells are not baked yet" in why
+    assert succeed(*words)["probes"]["count"] == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (("--probes", "many"), "whole number"),
+        (("--probes", "-1"), "whole number"),
+        (("--probe-megabytes", "0"), "number of megabytes above 0"),
+        (("--probe-megabytes", "nan"), "number of megabytes above 0"),
+    ],
+)
+def test_words_that_make_no_sense_are_wrong_usage(tmp_path, words, why):
+    said = call("bake", tmp_path / "scene.giv", "-o", tmp_path / "bake", *words)
+    assert said.code == 2
+    assert why in said.err
