@@ -320,7 +320,8 @@ def _make_probes(work: Work, wish: Wish | None, missing: int, progress: Progress
         progress.stage("Probes", STEPS)
         return probe_job.run(job, lambda share: progress.show(int(share * STEPS))), ""
     if (target / PROBES).exists() and missing == 0:
-        (target / PROBES).unlink()
+        for path in (target / PROBES, *target.glob("cell_*.probes")):
+            path.unlink()
         folder.list_again(target)
     return Made(0, 0), why
 

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from . import folder, harmonics, planes
+from . import folder, harmonics, planes, probe_cells, probe_file
 from .blend import blend, clamp
 from .container import FileError
 from .grid import Grid
@@ -332,7 +332,7 @@ def load(path: str | os.PathLike) -> World:
             name = f"cell_{entry['cell'][0]}_{entry['cell'][1]}.tree"
             raise FileError(os.path.join(path, name), 0, "this cell is of another bake than world.json")
         cells.append(cell)
-    return World(header, cells)
+    return World(header, cells, probe_file.load(path, header), probe_cells.load(path, header, cells))
 
 
 def _data_points(grid: Grid, cells: list[folder.Cell]) -> DataPoints:
