@@ -121,7 +121,7 @@ def answers(baked: Baked, mirrors: Mirrors, roughness: float) -> dict[str, np.nd
     point, rough = loaded.grid.to_local(mirrors.point), np.full(len(mirrors.point), roughness)
     rays = Rays(point, mirrors.direction, rough, mirrors.normal)
     probes = loaded._reflections
-    levels = probes.mixed(loaded._factors(None, None, "all"))
+    levels = probes.mixed(loaded._sources.factors(None, None, "all"))
     found = {
         "nearest": without_sight(Nearest(probes, 1), rays, levels),
         "blend": without_sight(Nearest(probes, NEIGHBOURS), rays, levels),

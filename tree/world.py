@@ -22,14 +22,11 @@ from .lookup import Atlas
 from .probe_maps import ProbeMaps
 from .probe_sets import ProbeSets
 from .reflections import Rays, Reflections
-from .suns import SunKeys
+from .sources import TRANSPORTS, Sources
 from .values import Values
 
 __all__ = ["TRANSPORTS", "World", "load"]
 
-TRANSPORTS = ("all", "local", "sun", "sky")
-FIXED_SUN = np.radians(1.0)
-"""How far from a baked direction a fixed sun may be asked for [rad]: two disks of the sun."""
 LARGEST = np.finfo(np.float32).max / 100
 """Limit of coefficients, so that no sum of them overflows."""
 CHUNK = 1 << 16
@@ -76,19 +73,15 @@ class World:
         self._data = _data_points(self.grid, cells)
         names = [name for name in TRANSPORTS[1:] if any(name in cell.payloads for cell in cells)]
         self._values = {name: _join(name, cells, self._data.atlas) for name in names}
-        sun = header.get("transports", {}).get("sun") or {}
-        self._keys = SunKeys(np.array(sun["directions"])) if sun.get("directions") else None
+        functions = {name: values.functions for name, values in self._values.items()}
+        self._sources = Sources(header.get("transports", {}), functions)
         self._remembered: dict[tuple, np.ndarray] = {}
-        self._sun_is_free = bool(sun.get("free", True))
-        own = sun.get("scene") or []
-        self._own_direction = np.array([entry["direction"] for entry in own], np.float64).reshape(-1, 3)
-        self._own_irradiance = np.array([entry["irradiance"] for entry in own], np.float64).reshape(-1, 3)
         self._reflections = Reflections(self._data, maps, sets) if maps is not None and len(maps.position) else None
 
     @property
     def sun_irradiance(self) -> np.ndarray:
         """(3,) float64 irradiance of the scene's own suns together, on surfaces that face them [W/m2]."""
-        return self._own_irradiance.sum(axis=0) if len(self._own_irradiance) else np.ones(3)
+        return self._sources.sun_irradiance
 
     def irradiance(
         self,
@@ -134,7 +127,7 @@ class World:
         points, normals = _check_rows(points, "points"), _check_rows(normals, "normals")
         if len(points) != len(normals):
             raise ValueError(f"{len(points)} points and {len(normals)} normals; as many are needed")
-        values = self._folded(self._factors(sun, sky, transport))
+        values = self._folded(self._sources.factors(sun, sky, transport))
         result = np.zeros((len(points), 3), np.float32)
         for start in range(0, len(points), CHUNK):
             part = slice(start, start + CHUNK)
@@ -193,7 +186,7 @@ class World:
             raise ValueError(f"{len(points)} points, {counts}; as many are needed")
         if not directions.any(axis=1).all():
             raise ValueError(f"directions: row {int(np.argmin(directions.any(axis=1)))} has no length")
-        factors, result = self._factors(sun, sky, "all"), np.zeros((len(points), 3), np.float32)
+        factors, result = self._sources.factors(sun, sky, "all"), np.zeros((len(points), 3), np.float32)
         points = clamp(self._data, self.grid.to_local(points))
         directions, normals = (_unit(rows).astype(np.float32) for rows in (directions, normals))
         for start in range(0, len(points), RAYS):
@@ -239,69 +232,6 @@ class World:
             folded = np.concatenate([np.zeros((len(self._data.valid), 0), np.float32), *parts], axis=1)
             self._remembered[key] = np.clip(folded, -LARGEST, LARGEST, out=folded)
         return self._remembered[key]
-
-    def _factors(self, sun: tuple | None, sky: np.ndarray | float | None, transport: str) -> dict[str, np.ndarray]:
-        """(K, 3) factors of the functions of each transport that counts."""
-        if transport not in TRANSPORTS:
-            raise ValueError(f"transport {transport!r}; one of {', '.join(TRANSPORTS)} is needed")
-        sun_factor, sky_factor = self._sun_factor(sun, transport == "sun"), self._sky_factor(sky)
-        chosen = {"local": np.ones((1, 3)), "sun": sun_factor, "sky": sky_factor}
-        return {k: v for k, v in chosen.items() if k in self._values and transport in ("all", k)}
-
-    def _sun_factor(self, sun: tuple | None, per_unit: bool) -> np.ndarray | None:
-        """Weights of the sun keys; relative to the suns' irradiance if asked for."""
-        if sun is None:
-            direction, irradiance = self._own_direction, self._own_irradiance
-        else:
-            if not isinstance(sun, tuple | list) or len(sun) != 2 or np.size(sun[0]) % 3:
-                raise ValueError("sun is a pair of direction and irradiance: ((x, y, z), 2.0)")
-            direction = _finite(sun[0], "sun direction").reshape(-1, 3)
-            irradiance = np.broadcast_to(_finite(sun[1], "sun irradiance"), (len(direction), 3))
-            self._check_sun(direction)
-        if (irradiance < 0).any():
-            raise ValueError("the sun's irradiance is negative")
-        if "sun" not in self._values or self._keys is None:
-            return None
-        if per_unit and not len(direction):
-            raise ValueError("the bake has no sun of its own; name its direction")
-        if per_unit:
-            total = irradiance.sum(axis=0)
-            irradiance = np.where(total > 0, irradiance / np.where(total > 0, total, 1.0), 1.0 / len(direction))
-        index, weight = self._keys.interpolate(direction)
-        factor = np.zeros((len(self._keys.directions), 3))
-        for corner in range(3):
-            for channel in range(3):
-                part = weight[:, corner] * irradiance[:, channel]
-                factor[:, channel] += np.bincount(index[:, corner], part, len(factor))
-        return factor
-
-    def _check_sun(self, direction: np.ndarray) -> None:
-        """A bake of fixed suns knows no other direction; to answer as if it did would be a guess."""
-        if self._sun_is_free or self._keys is None or not len(direction):
-            return
-        length = np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), np.finfo(np.float64).tiny)
-        nearest = (direction / length @ self._keys.directions.T).max(axis=1)
-        if (nearest < np.cos(FIXED_SUN)).any():
-            known = "; ".join(",".join(f"{value:.3g}" for value in key) for key in self._keys.directions)
-            raise ValueError(
-                f"the bake holds the sun at {known} only; bake with --sun hemisphere or arc:FILE to move it"
-            )
-
-    def _sky_factor(self, sky: np.ndarray | float | None) -> np.ndarray | None:
-        """Weights of the sky's functions."""
-        values = self._values.get("sky")
-        given = None if sky is None else _finite(sky, "sky")
-        if values is None:
-            return None
-        count = values.functions
-        own = self.header["transports"]["sky"].get("radiance") if count > 1 else [[1.0, 1.0, 1.0]]
-        if given is None:
-            return np.array(own, np.float64)
-        if given.shape in ((), (1,), (3,)):
-            return np.array(own, np.float64) * given
-        if given.shape != (count, 3) or count == 1:
-            raise ValueError(f"a sky of shape {given.shape}; this bake takes a factor" + " or (9, 3)" * (count > 1))
-        return given
 
 
 def load(path: str | os.PathLike) -> World:
@@ -375,14 +305,6 @@ def _check_roughness(values: np.ndarray | float, count: int) -> np.ndarray:
     if values.ndim != 1 or not ((values >= 0) & (values <= 1)).all():
         raise ValueError("roughness is a number from 0 to 1, or one for each point")
     return values
-
-
-def _finite(value: object, what: str) -> np.ndarray:
-    """A finite float64 array."""
-    value = np.asarray(value, np.float64)
-    if not np.isfinite(value).all():
-        raise ValueError(f"the {what} is not finite")
-    return value
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
