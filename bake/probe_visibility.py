@@ -1,10 +1,9 @@
 """Which probes show what the surroundings of each data point reflect: the few that together show it best.
 
 Comes in: a scene, data points, places of probes. Goes out: probes with weights for each data point. Rays leave the
-data point in all directions, as the surfaces around it mirror most of them, and objects that move all; those that end
-close by count little, as they meet the very surface that mirrors. Shadow rays go from what they meet to all probes that
-would show it well. Probes are chosen greedily, by what each adds to the best worth (`views.py`) over all rays; the
-weight of each is the share of the rays that it shows best.
+data point in all directions, as the surfaces around it mirror most of them, and objects that move all. Shadow rays go
+from what they meet to all probes that would show it well. Probes are chosen greedily, by what each adds to the best
+worth (`views.py`) over all rays; the weight of each is the share of the rays that it shows best.
 """
 
 from __future__ import annotations
@@ -29,13 +28,10 @@ from .views import LEAST, worths
 __all__ = ["RAYS", "SLOTS", "see"]
 
 RAYS = 24
-"""Rays of a data point; 16 reflect 1 % worse, 64 no better (`docs/accuracy.md`)."""
+"""Rays of a data point: neither 16 nor 48 reflect better in all scenes (`docs/accuracy.md`)."""
 
 SLOTS = 4
-"""Probes of a data point: 3 reflect 8 % worse, 6 4 % better at half as many bytes again (`docs/accuracy.md`)."""
-
-CLOSE = np.float32(0.5)
-"""Length at which rays count by a half [voxels]."""
+"""Probes of a data point: 3 reflect 2 % worse, 6 no better (`docs/accuracy.md`)."""
 
 FAR = np.float32(4)
 """Length of shadow rays towards the sky, in sizes of the scene: past everything."""
@@ -51,13 +47,11 @@ class _Shown:
     place : Patches, (m,) where they end; of rays that leave the scene, where they begin
     direction : (3, m) float32
     leaves : (m,) bool, whether they meet nothing
-    weight : (m,) float32, how much they count, 0 to 1
     """
 
     place: Patches
     direction: np.ndarray
     leaves: np.ndarray
-    weight: np.ndarray
 
 
 def see(
@@ -105,9 +99,8 @@ def see(
     def work(part: np.ndarray) -> int:
         some = rows[part]
         position = np.ascontiguousarray(data.position[some].T.astype(np.float32))
-        shown = _look(scene, position, data.size[some].astype(np.float32), key[some])
-        worth = _seen(scene, place, shown, _nearness(place, position))
-        probe[some], weight[some] = _best(worth * shown.weight.reshape(worth.shape[1:]))
+        worth = _seen(scene, place, _look(scene, position, key[some]), _nearness(place, position))
+        probe[some], weight[some] = _best(worth)
         return len(part)
 
     if len(probes):
@@ -115,8 +108,8 @@ def see(
     return encode(probe, weight, data.valid)
 
 
-def _look(scene: Scene, position: np.ndarray, size: np.ndarray, key: np.ndarray) -> _Shown:
-    """What rays from data points meet; from voxels of some sizes, with random keys."""
+def _look(scene: Scene, position: np.ndarray, key: np.ndarray) -> _Shown:
+    """What rays from data points meet, by their random keys."""
     lane, sample = np.divmod(np.arange(len(key) * RAYS), RAYS)
     sampler = Sampler(key, 0, RAYS)
     direction = warp.sphere(*(sampler.uniform(lane, sample, dimension) for dimension in (0, 1)))
@@ -127,8 +120,7 @@ def _look(scene: Scene, position: np.ndarray, size: np.ndarray, key: np.ndarray)
     normal = hits.facing(direction)
     end = start + direction * length
     end += np.where(leaves, 0, normal * (4 * scene.tracer.offset(end, length)))
-    weight = np.where(leaves, np.float32(1), length / (length + CLOSE * size[lane]))
-    return _Shown(Patches(end, normal, weight, length), direction, leaves, weight)
+    return _Shown(Patches(end, normal, np.ones_like(length), length), direction, leaves)
 
 
 def _nearness(probe: np.ndarray, position: np.ndarray) -> np.ndarray:

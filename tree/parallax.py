@@ -20,7 +20,7 @@ from .probe_atlas import Layout, fetch
 __all__ = ["Found", "Nearness", "march"]
 
 STEPS = 8
-"""Parts of the ray: with six errors are 3 % larger, with twelve they are no smaller (`docs/accuracy.md`)."""
+"""Parts of the ray: with six errors are 5 % larger, with twelve 5 % smaller (`docs/accuracy.md`)."""
 
 SOFT = 0.03
 """Distance from what the probe sees within which it is open whether a point lies before or behind, in its distance: no
