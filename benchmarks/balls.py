@@ -133,7 +133,7 @@ def pictures(baked: Baked, shelf: Shelf, width: int, paths: int) -> tuple[np.nda
         normal = (point - center[number[rows]]) / shelf.radius
         mirrored = direction[rows] - 2 * np.einsum("nc,nc->n", direction[rows], normal)[:, None] * normal
         rays = Mirrors(point, normal.astype(np.float32), mirrored.astype(np.float32))
-        out[0, rows] = baked.world.radiance(point, mirrored, ball_roughness)
+        out[0, rows] = baked.world.radiance(point, mirrored, ball_roughness, normals=normal)
         out[1, rows] = gathered(baked, rays, ball_roughness, paths, SEED)
     return tuple(out.reshape(2, size[1], size[0], 3))
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from . import octahedral
-from .probe_atlas import Layout, fetch
+from .probe_atlas import BORDER, Layout, fetch_between
 
 __all__ = ["Found", "Nearness", "march"]
 
@@ -40,7 +40,7 @@ SHORT = 0.05
 """Length of rays below which what they meet cannot be told from where they start, in the probe's distance: two texels.
 Behind a thin wall rays seem to end at its other side, at once."""
 
-LOST = 0.3
+LOST = 0.5
 """Part of a ray that ends with each step behind what the probe sees: what it meets may well lie there."""
 
 LEAST = 1e-3
@@ -58,11 +58,12 @@ class Nearness:
     """Distances of an atlas of probes, as `march` reads them.
 
     layout : Layout, where tiles lie
-    nearness : (rows, columns, 1) float32 [1/m], reciprocal of the sum of the components of the way to what texels see
+    levels : tuple of (rows_l, columns_l, 1) float32 [1/m], reciprocal of the sum of the components of the way to what
+        texels see; on levels after the first the mean over what a texel covers
     """
 
     layout: Layout
-    nearness: np.ndarray
+    levels: tuple[np.ndarray, ...]
 
     @classmethod
     def of(cls, layout: Layout, distance: np.ndarray) -> Nearness:
@@ -82,9 +83,11 @@ class Nearness:
         """
         size = octahedral.add_border(np.abs(octahedral.centers(layout.sizes[0])).sum(axis=-1)).astype(np.float32)
         tiles = np.tile(size, (layout.rows, layout.columns))
-        return cls(layout, (1 / np.maximum(distance.astype(np.float32) * tiles, TINY))[..., None])
+        first = 1 / np.maximum(distance.astype(np.float32) * tiles, TINY)
+        rest = (_averaged(first, layout, level) for level in range(1, layout.levels))
+        return cls(layout, (first[..., None], *rest))
 
-    def at(self, probe: np.ndarray, way: np.ndarray) -> np.ndarray:
+    def at(self, probe: np.ndarray, way: np.ndarray, level: np.ndarray) -> np.ndarray:
         """Compare points with what probes see in their directions.
 
         Parameters
@@ -93,6 +96,8 @@ class Nearness:
             Numbers of probes.
         way : (n, 3) float32 ndarray
             From the probe to the point [m].
+        level : (n,) float64 ndarray
+            How blurred.
 
         Returns
         -------
@@ -100,7 +105,26 @@ class Nearness:
             The point's distance over that of what is seen; above 1 behind it, 0 before the sky.
         """
         x, y, z = np.abs(way.T)
-        return (x + y + z) * fetch(self.nearness, self.layout, 0, probe, way)[:, 0]
+        return (x + y + z) * fetch_between(self.levels, self.layout, level, probe, way)[:, 0]
+
+
+def _averaged(first: np.ndarray, layout: Layout, level: int) -> np.ndarray:
+    """One level: means over what its texels cover. As means of planes they lie on them again."""
+    pitch, small, inner = layout.pitch, layout.pitch >> level, slice(BORDER, -BORDER)
+    weight = _covering(layout.sizes[level], layout.sizes[0])
+    tiles = first.reshape(layout.rows, pitch, layout.columns, pitch).transpose(0, 2, 1, 3)[:, :, inner, inner]
+    out = np.empty((layout.rows * small, layout.columns * small, 1), np.float32)
+    for row, column in np.ndindex(layout.rows, layout.columns):
+        image = weight @ tiles[row, column] @ weight.T
+        out[row * small :, column * small :][:small, :small, 0] = octahedral.add_border(image)
+    return out
+
+
+def _covering(coarse: int, fine: int) -> np.ndarray:
+    """(coarse, fine) float32 parts of coarse texels that fine ones cover, along one axis."""
+    begin, other = np.arange(coarse)[:, None] / coarse, np.arange(fine) / fine
+    part = np.minimum(begin + 1 / coarse, other + 1 / fine) - np.maximum(begin, other)
+    return (np.maximum(part, 0) * coarse).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +143,9 @@ class Found:
     ratio: np.ndarray
 
 
-def march(near: Nearness, probe: np.ndarray, offset: np.ndarray, direction: np.ndarray) -> Iterator[Found]:
+def march(
+    near: Nearness, probe: np.ndarray, offset: np.ndarray, direction: np.ndarray, level: np.ndarray
+) -> Iterator[Found]:
     """Follow rays through what probes see.
 
     Parameters
@@ -132,6 +158,8 @@ def march(near: Nearness, probe: np.ndarray, offset: np.ndarray, direction: np.n
         From it to the ray's start [m].
     direction : (n, 3) float32 ndarray
         Unit vectors.
+    level : (n,) float64 ndarray
+        How blurred what probes see is to be, as of `Nearness.at`.
 
     Yields
     ------
@@ -145,7 +173,7 @@ def march(near: Nearness, probe: np.ndarray, offset: np.ndarray, direction: np.n
     before or behind. Of those that go behind only what meets a surface on the way is found.
     Source: Szirmay-Kalos et al. 2005, "Approximate Ray-Tracing on the GPU with Distance Impostors"; the rest is ours.
     """
-    rays = _Rays(near, probe, offset, direction)
+    rays = _Rays(near, probe, offset, direction, level)
     low = rays.gap(1.0)
     behind = np.clip(low.value / np.maximum(low.m, TINY) * np.float32(-1 / SOFT), 0, 1)
     before, behind = 1 - behind, behind * np.float32(1 - LOST)
@@ -177,15 +205,15 @@ class _Gap:
 class _Rays:
     """Rays as probes see them."""
 
-    def __init__(self, near: Nearness, probe: np.ndarray, offset: np.ndarray, direction: np.ndarray) -> None:
+    def __init__(self, near: Nearness, probe: np.ndarray, offset: np.ndarray, direction: np.ndarray, level) -> None:
         length = np.sqrt((offset * offset).sum(axis=1, keepdims=True))
-        self._near, self._probe, self._offset = near, probe, offset
+        self._near, self._probe, self._offset, self._level = near, probe, offset, level
         self._length = np.maximum(length, SHORTEST)
         self._way = self._length * direction
 
     def gap(self, r: float) -> _Gap:
         """Of the points r of all rays."""
-        m = self._near.at(self._probe, r * self._offset + (1 - r) * self._way)
+        m = self._near.at(self._probe, r * self._offset + (1 - r) * self._way, self._level)
         return _Gap(r, np.float32(r) - m, m)
 
     def met(self, low: _Gap, high: _Gap, goes: np.ndarray) -> tuple[Found, np.ndarray]:
@@ -230,7 +258,7 @@ class _Rays:
     def _at(self, row: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Points r of some rays, their gaps, and m(r)."""
         toward = r[:, None] * self._offset[row] + (1 - r)[:, None] * self._way[row]
-        m = self._near.at(self._probe[row], toward)
+        m = self._near.at(self._probe[row], toward, self._level[row])
         return toward, r - m, m
 
 

@@ -21,7 +21,7 @@ from .blend import shares
 from .interpolate import DataPoints
 from .parallax import Nearness, march
 from .payload import NO_DATA
-from .probe_atlas import fetch
+from .probe_atlas import fetch_between
 from .probe_maps import ProbeMaps
 from .probe_sets import WHOLE, ProbeSets
 
@@ -35,6 +35,10 @@ ENOUGH = 0.02
 
 NEAR = np.float32(4)
 """Distance from a probe at which it counts by a half, in lengths of the ray; as in `bake/views.py`."""
+
+SHARPER = 0.5
+"""Levels by which distances are sharper than radiance: on sharper ones rough surfaces show the edges of what is far as
+speckles, on others errors grow (`docs/accuracy.md`)."""
 
 LEAST = np.float32(0.1)
 """What a probe counts at least: where rays are short, none is to count alone for seeing something far behind."""
@@ -173,30 +177,20 @@ class Reflections:
         used, count = self.used(rays.point, rays.normal), len(rays.point)
         total, weights = np.zeros((count, 3)), np.zeros((2, count))
         offset = (rays.point[used.point] - self._position[used.probe]).astype(np.float32)
-        for found in march(self._near, used.probe, offset, rays.direction[used.point]):
+        sharp = np.maximum(ggx.level_of(rays.roughness, self._ladder) - SHARPER, 0)
+        for found in march(self._near, used.probe, offset, rays.direction[used.point], sharp[used.point]):
             point, weight = used.point[found.row], used.weight[found.row] * found.weight
             q = np.square(NEAR * found.ratio)
             worth = weight * np.maximum(q / (1 + q), LEAST)
             blur = rays.roughness[point] * np.sqrt(np.minimum(found.ratio, WIDEST))
-            light = self._fetch(levels, used.probe[found.row], found.toward, blur)
+            level = ggx.level_of(blur, self._ladder)
+            light = fetch_between(levels, self._layout, level, used.probe[found.row], found.toward)
             for channel in range(3):
                 total[:, channel] += np.bincount(point, worth * light[:, channel], count)
             for row, values in enumerate((weight, worth)):
                 weights[row] += np.bincount(point, values, count)
         mean = total / np.where(weights[1] > 0, weights[1], 1)[:, None]
         return mean.astype(np.float32), np.minimum(weights[0] / ENOUGH, 1).astype(np.float32)
-
-    def _fetch(self, levels, probe: np.ndarray, toward: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-        """(m, 3) radiance between the two levels around a roughness."""
-        level = ggx.level_of(roughness, self._ladder)
-        below = np.minimum(np.floor(level).astype(np.int64), len(levels) - 1)
-        part = (level - below).astype(np.float32)[:, None]
-        light = np.zeros((len(probe), 3), np.float32)
-        for number, atlas in enumerate(levels):
-            for row, share in ((below == number, 1 - part), (below == number - 1, part)):
-                some = np.flatnonzero(row & (share[:, 0] > 0))
-                light[some] += share[some] * fetch(atlas, self._layout, number, probe[some], toward[some])
-        return light
 
 
 def _joined(sets: Sequence[ProbeSets]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -52,7 +52,9 @@ def followed(maps: ProbeMaps, start: np.ndarray, direction: np.ndarray) -> tuple
     near = Nearness.of(maps.layout, maps.distance)
     toward, best, total = np.zeros_like(start), np.zeros(len(start)), np.zeros(len(start))
     offset = (start - PROBE).astype(np.float32)
-    for found in march(near, np.zeros(len(start), np.int64), offset, direction.astype(np.float32)):
+    for found in march(
+        near, np.zeros(len(start), np.int64), offset, direction.astype(np.float32), np.zeros(len(start))
+    ):
         total[found.row] += found.weight
         more = found.weight > best[found.row]
         rows = found.row[more]
@@ -97,7 +99,7 @@ def test_distances_that_were_mixed_themselves_would_miss_walls():
     size = maps.layout.sizes[0]
     direction = octahedral.decode(np.random.default_rng(2).uniform(0.55, 0.95, (1000, 2)) * [0.5, 0.5] + 0.25)
     near = Nearness.of(maps.layout, maps.distance)
-    value = near.at(np.zeros(1000, np.int64), direction.astype(np.float32))
+    value = near.at(np.zeros(1000, np.int64), direction.astype(np.float32), np.zeros(1000))
     ceiling = direction[:, 2] * 3 / (HIGH[2] - PROBE[0, 2])
     meets_ceiling = (np.abs(PROBE + direction * (HIGH[2] - PROBE[0, 2]) / direction[:, 2:]) < 1.5)[:, :2].all(axis=1)
     clear = meets_ceiling & (np.abs(direction[:, :2]) > 4 / size).all(axis=1)

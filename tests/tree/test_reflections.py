@@ -105,7 +105,7 @@ def test_without_parallax_the_wrong_wall_would_be_shown(room, monkeypatch):
     point, direction = rays(2000)
     hit = hits(point, direction)
     near = room._reflections._near
-    monkeypatch.setattr(type(near), "at", lambda self, probe, way: np.zeros(len(probe), np.float32))
+    monkeypatch.setattr(type(near), "at", lambda self, probe, way, level: np.zeros(len(probe), np.float32))
     off = np.abs(room.radiance(point, direction, 0.0) - walls(hit)).max(axis=1)
     assert off.mean() > 0.2
 
