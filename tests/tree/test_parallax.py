@@ -47,13 +47,13 @@ def rays(count: int, seed: int = 0, margin: float = 0.01) -> tuple[np.ndarray, n
     return start, direction / np.linalg.norm(direction, axis=1, keepdims=True)
 
 
-def followed(maps: ProbeMaps, start: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def followed(maps: ProbeMaps, start: np.ndarray, direction: np.ndarray, level=0.0) -> tuple[np.ndarray, np.ndarray]:
     """(n, 3) unit vectors to what is met, the heaviest of each ray, and (n,) sums of weights."""
     near = Nearness.of(maps.layout, maps.distance)
     toward, best, total = np.zeros_like(start), np.zeros(len(start)), np.zeros(len(start))
     offset = (start - PROBE).astype(np.float32)
     for found in march(
-        near, np.zeros(len(start), np.int64), offset, direction.astype(np.float32), np.zeros(len(start))
+        near, np.zeros(len(start), np.int64), offset, direction.astype(np.float32), np.full(len(start), level)
     ):
         total[found.row] += found.weight
         more = found.weight > best[found.row]
@@ -91,6 +91,22 @@ def test_rays_in_a_room_meet_its_walls_to_two_hundredths_of_a_texel():
     assert off[clear].max() < 2
     assert np.quantile(off[length > 0.5], 0.98) < 1
     assert np.quantile(weight[clear], 0.01) > 0.9
+
+
+def test_blurred_distances_keep_walls_where_they_are():
+    """To a tenth of a texel of the level, away from edges and from the planes that part the map's eight faces."""
+    scene, maps = room()
+    start, direction = rays(5000)
+    want, length = exact(start, direction, scene)
+    away = (edge_of(start + direction * length[:, None]) > 0.3) & (edge_of(start) > 0.3) & (length > 0.5)
+    for level in (0.5, 1.0):
+        texel = np.sqrt(4 * np.pi) / maps.layout.sizes[0] * 2**level
+        clear = away & (np.abs(want) > texel).all(axis=1)
+        toward, weight = followed(maps, start, direction, level)
+        off = np.linalg.norm(toward - want, axis=1) / texel
+        assert clear.sum() > 100
+        assert np.quantile(off[clear], 0.9) < 0.1
+        assert weight[clear].mean() > 0.95
 
 
 def test_distances_that_were_mixed_themselves_would_miss_walls():
