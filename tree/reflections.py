@@ -31,8 +31,8 @@ MOST = 8
 """Probes that count at a point; four make errors no more than 2 % larger (`docs/accuracy.md`)."""
 
 ENOUGH = 0.1
-"""Weight of probes that see what a ray meets below which a part comes from elsewhere: with 0.02 rays in full rooms are a
-fifth more wrong, with 0.2 rays to the sky a tenth."""
+"""Weight of probes that see what a ray meets below which a part comes from elsewhere: with 0.02 rays in full rooms are
+a fifth more wrong, with 0.2 rays to the sky a tenth."""
 
 NEAR = np.float32(4)
 """Distance from a probe at which it counts by a half, in lengths of the ray; as in `bake/views.py`."""
