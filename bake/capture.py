@@ -29,8 +29,8 @@ __all__ = ["PITCH", "Spending", "Studio", "capture", "shoot"]
 PITCH = 128
 """Width of a tile: a map of 126 x 126 texels is as sharp as roughness 0.12, a texel 1.6 degrees wide."""
 
-FIRST_RAYS = 4
-"""Rays of each half in the first round."""
+FIRST_RAYS = 8
+"""Rays of each half in the first round: fewer make edges of things rough, and may by chance miss what is rare."""
 
 HALVES = 2
 """Independent halves of a texel's rays."""
@@ -172,7 +172,8 @@ def shoot(scene: Scene, studio: Studio, rows: np.ndarray, progress: Callable[[in
             place = studio.maps.position[row] - scene.origin
             around = Panorama(scene, place, size, studio.effort.bounces, studio.effort.seed)
             seen = around.surfaces()
-            _put_radiance(studio, row, _radiance(studio, row, around, alike(seen)))
+            if studio.maps.radiance:
+                _put_radiance(studio, row, _radiance(studio, row, around, alike(seen)))
             _put_surfaces(studio.maps, row, seen)
         return len(tile)
 
@@ -226,4 +227,4 @@ def _put_surfaces(maps: ProbeMaps, row: int, seen: Seen) -> None:
     distance = np.where(seen.distance > FARTHEST, np.float32(np.inf), seen.distance)
     put(maps.distance, maps.layout, 0, row, distance.reshape(size, size).astype(np.float16))
     put(maps.normal, maps.layout, 0, row, seen.normal.T.reshape(size, size, 3).astype(np.float16))
-    put(maps.albedo, maps.layout, 0, row, rounded(np.ascontiguousarray(seen.albedo.T)).reshape(size, size, 3))
+    put(maps.albedo, maps.layout, 0, row, rounded(seen.albedo.T).reshape(size, size, 3))

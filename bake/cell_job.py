@@ -165,12 +165,27 @@ class Work:
             return cached
         made = check(cached, self.scene, self.grid, voxels.coords, self.judge, self.target.effort, count)
         self.checks[voxels.cell] = made
-        if not made.fails(self.settings.error or ERRORS["preview"]):
+        if not self.fails(made):
             return cached
         self.warnings.append(
             f"cell {list_of([voxels.cell])}: the surface cache is too far off, so paths went to their end"
         )
         return self.scene
+
+    def fails(self, made: Check) -> bool:
+        """Say whether a cache is too far off for this bake.
+
+        Parameters
+        ----------
+        made : Check
+            Of a cell.
+
+        Returns
+        -------
+        bool
+            Beyond doubt.
+        """
+        return made.fails(self.settings.error or ERRORS["preview"])
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,9 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..tree import build, folder
+from ..tree import build, folder, probe_file
 from ..tree.grid import FIRST_SIZE, Grid
-from ..tree.probe_file import PROBES
 from ..tree.topology import Topology
 from . import changes, memory, probe_job, snapshot_file, summary
 from .cell_job import History, Work, bake_cell, list_of, look_early
@@ -307,9 +306,8 @@ def _make_probes(work: Work, wish: Wish | None, missing: int, progress: Progress
     """Reflection probes, or why there are none; older ones go then."""
     settings, target = work.settings, work.place.target
     effort = Effort(0, settings.bounces, settings.seed, work.target.effort.threads)
-    job = probe_job.Job(
-        work.scene, work.grid, target, work.judge.mean, wish or Wish(), effort, settings.method == "cache"
-    )
+    trusted = settings.method == "cache" and not any(work.fails(check) for check in work.checks.values())
+    job = probe_job.Job(work.scene, work.grid, target, work.judge.mean, wish or Wish(), effort, trusted)
     if wish is None:
         why = "none were asked for"
     elif missing:
@@ -319,8 +317,8 @@ def _make_probes(work: Work, wish: Wish | None, missing: int, progress: Progress
     if not why:
         progress.stage("Probes", STEPS)
         return probe_job.run(job, lambda share: progress.show(int(share * STEPS))), ""
-    if (target / PROBES).exists() and missing == 0:
-        for path in (target / PROBES, *target.glob("cell_*.probes")):
+    if missing == 0 and probe_file.describe(target) is not None:
+        for path in (target / probe_file.PROBES, *target.glob("cell_*.probes")):
             path.unlink()
         folder.list_again(target)
     return Made(0, 0), why

@@ -70,6 +70,21 @@ class Patches:
     weight: np.ndarray
     reach: np.ndarray
 
+    def take(self, rows: np.ndarray) -> Patches:
+        """Some of them.
+
+        Parameters
+        ----------
+        rows : (m,) int64 ndarray
+            Which.
+
+        Returns
+        -------
+        Patches
+            Copies.
+        """
+        return Patches(self.start[:, rows], self.normal[:, rows], self.weight[rows], self.reach[rows])
+
 
 def patches(scene: Scene, forest: Forest, effort: Effort) -> Patches:
     """Cut surfaces into patches.

@@ -18,7 +18,7 @@ from .candidates import Candidates, candidates
 from .gather import Effort
 from .greedy import Choice, choose
 from .parallel import CancelledError
-from .patches import Forest, patches
+from .patches import Forest, Patches, patches
 from .scene import Scene
 from .views import affordable, views
 
@@ -45,6 +45,7 @@ class Request:
     least_gain : stop below this part of the gain of the best single probe, 0 to 1
     pinned : (m, 3) float64 [m], probes that are there anyway, relative to the scene's origin
     deleted : (b, 2, 3) float64 [m], lowest and highest corners of boxes that get no others
+    counts : callable, says which patches count, (n,) bool of `Patches`; all that see others when left out
     """
 
     count: int = 1000
@@ -53,6 +54,7 @@ class Request:
     least_gain: float = LEAST_GAIN
     pinned: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     deleted: np.ndarray = field(default_factory=lambda: np.zeros((0, 2, 3)))
+    counts: Callable[[Patches], np.ndarray] | None = None
 
     def limit(self) -> int:
         """Count probes that count and budget allow.
@@ -140,6 +142,8 @@ def place(
     limit = request.limit()
     _show(progress, 0.0)
     seen = patches(scene, forest, effort)
+    if request.counts is not None:
+        seen = seen.take(np.flatnonzero(request.counts(seen)))
     _show(progress, 0.2)
     found = candidates(scene, forest, np.asarray(request.deleted, np.float64), effort)
     found = found.thinned(affordable(scene, found.position, seen, effort.threads))

@@ -6,15 +6,16 @@
 Probes are placed and captured as a bake of these settings does it, by the surface cache. `rays_per_s` is what one
 thread meets in a second of processor time, `embreex_per_s` the same rays with nothing around them. `noise` is what
 probes say of themselves; `error` compares texels of the sharpest level with plain path tracing without a cache, 256
-rays through each of 2,000 texels, whose own noise is taken off: root mean square, over the light there plus the map's
-mean. `energy` is the mean of these texels over that of the tracing. Pictures show all directions, upwards is above: as
-captured, path traced, and the difference.
+rays through each of 1,000 texels of every probe, whose own noise is taken off: root mean square, over the light there
+plus the map's mean. `energy` is the mean of these texels over that of the tracing. Pictures show all directions,
+upwards is above: as captured, path traced, and the difference.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import os
 import tempfile
 import time
@@ -27,6 +28,7 @@ from gi_volumes.bake import job, patches, paths, probe_job, probes, radiosity, s
 from gi_volumes.bake.capture import Studio, shoot
 from gi_volumes.bake.gather import Effort
 from gi_volumes.bake.lamps import LUMINANCE
+from gi_volumes.bake.lit_patches import are_lit
 from gi_volumes.bake.picture import panels
 from gi_volumes.bake.scene import prepare
 from gi_volumes.bake.settings import Settings, choose_grid, model
@@ -38,8 +40,8 @@ from gi_volumes.tree.build import build, occupied_cells
 from gi_volumes.tree.probe_atlas import fetch
 from PIL import Image
 
-TEXELS, RAYS = 2000, 256
-"""Texels that are compared, and rays through each."""
+TEXELS, RAYS = 1000, 256
+"""Texels of a probe that are compared, and rays through each."""
 
 BOUNCES = 24
 """Of the path tracing: what is left after them is less than its noise."""
@@ -78,7 +80,8 @@ class Bench:
         """(k, 3) where probes stand."""
         corners = self.scene.soup.corners
         trees = tuple(build(corners, grid, tuple(cell)) for cell in occupied_cells(corners, grid))
-        return probes.place(self.scene, patches.Forest(grid, trees), probes.Request(count), self.effort).position
+        request = probes.Request(count, counts=functools.partial(are_lit, self.scene, self.effort))
+        return probes.place(self.scene, patches.Forest(grid, trees), request, self.effort).position
 
     def studio(self, place: np.ndarray, threads: int) -> Studio:
         """Make room for some probes.
@@ -210,7 +213,7 @@ def errors(bench: Bench, studio: Studio) -> dict[str, float]:
     size, generator, found = studio.maps.layout.sizes[0], np.random.default_rng(SEED), []
     area = octahedral.solid_angles(size).reshape(-1) / (4 * np.pi)
     for probe, place in enumerate(bench.place):
-        texel = generator.choice(size * size, TEXELS // len(bench.place) + 1, p=area)
+        texel = generator.choice(size * size, TEXELS, p=area)
         row, column = np.divmod(texel, size)
 
         def toward(pixel, u, v, row=row, column=column):

@@ -25,7 +25,7 @@ ROOMS = {
     **dict.fromkeys(BLENDER, ("operators/", "preview/draw.py")),
     "embreex": ("bake/rays.py",),
     "moderngl": ("preview/",),
-    "OpenEXR": ("tree/", "bake/picture.py"),
+    "OpenEXR": ("bake/picture.py",),
     "zstandard": ("tree/",),
     "PIL": ("bake/picture.py",),
 }

@@ -12,21 +12,23 @@ import build_scenes
 import numpy as np
 import pytest
 from command_line import QUICK, call, stored, succeed
-from gi_volumes.bake import cli, probe_job, radiosity
+from gi_volumes.bake import cell_job, cli, probe_job, radiosity
 from gi_volumes.bake.capture import Spending
 from gi_volumes.bake.gather import Effort
 from gi_volumes.bake.job import Manner, bake
+from gi_volumes.bake.lit_patches import are_lit
 from gi_volumes.bake.parallel import CancelledError
+from gi_volumes.bake.patches import Patches
 from gi_volumes.bake.probe_job import Job, Made, Wish, probe_bytes, run
 from gi_volumes.bake.probes import RequestError
-from gi_volumes.bake.scene import prepare
+from gi_volumes.bake.scene import Model, prepare
 from gi_volumes.bake.settings import Settings, model
 from gi_volumes.bake.snapshot import Channel, Material, Snapshot
 from gi_volumes.tree import container, folder, probe_cells, probe_file, world
 from gi_volumes.tree.verify import verify
 
 SETTINGS = Settings(samples=2, bounces=3, error=0.0, finest=2.0, sky="0.5,0.6,0.9")
-SPENDING = Spending(error=0.5, most=8, pitch=16)
+SPENDING = Spending(error=0.5, most=16, pitch=16)
 ORIGIN = np.array([1024.0, -2048.0, 0.0])
 
 
@@ -78,7 +80,7 @@ def test_probes_are_placed_captured_listed_and_found_sound(target):
     assert inside.all()
     assert made.bytes == (target / "probes.exr").stat().st_size
     assert made.noise <= 0.5
-    assert made.rays == 8
+    assert made.rays == 16
     assert maps.radiance["local"][0].astype(float).mean() > 0.05
     assert verify(target) == []
 
@@ -110,7 +112,8 @@ def test_a_damaged_file_is_made_again(target):
     assert bytes_in(target) == before
 
 
-def test_any_number_of_threads_gives_the_same_file(target):
+def test_any_number_of_threads_gives_the_same_file(target, monkeypatch):
+    monkeypatch.setattr(probe_job, "WORTH", 0)
     files = []
     for threads in (1, 2, 3):
         job = job_of(target, hall(0.2), effort=Effort(0, SETTINGS.bounces, 0, threads), cached=True)
@@ -128,7 +131,8 @@ def test_work_that_is_stopped_leaves_the_folder_as_it_was(target, share):
     assert bytes_in(target) == before
 
 
-def test_progress_rises_from_begin_to_end(target):
+def test_progress_rises_from_begin_to_end(target, monkeypatch):
+    monkeypatch.setattr(probe_job, "WORTH", 0)
     said = []
     run(job_of(target, hall(0.2), cached=True), lambda share: said.append(share) or True)
     assert said == sorted(said)
@@ -182,6 +186,36 @@ def test_the_same_bake_again_keeps_its_probes(target):
     assert bytes_in(target) == before
 
 
+def test_a_closed_dark_room_gets_no_probe(tmp_path, monkeypatch):
+    snapshot = hall(0.2)
+    cellar = build_scenes.box((14, 0.5, 0.1), (24, 8.5, 4.1), inward=True)
+    lights, wall = snapshot.lights, Material("wall", Channel((0.7, 0.6, 0.5)))
+    hall_walls = snapshot.geometry.positions.reshape(-1, 3, 3)
+    snapshot = build_scenes.snapshot([(hall_walls, wall), (cellar, wall)], lights, origin=ORIGIN)
+    bake(snapshot, tmp_path, SETTINGS)
+    run(job_of(tmp_path, snapshot, wish=Wish(6, spending=SPENDING)))
+    maps = probe_file.load(tmp_path, folder.load_header(tmp_path))
+    assert len(maps.position) == 6
+    assert not ((maps.position > at(14, 0.5, 0.1)) & (maps.position < at(24, 8.5, 4.1))).all(axis=1).any()
+    monkeypatch.setattr(probe_job, "are_lit", lambda scene, effort, seen: np.ones(len(seen.weight), bool))
+    run(job_of(tmp_path, snapshot, wish=Wish(5, spending=SPENDING)))
+    maps = probe_file.load(tmp_path, folder.load_header(tmp_path))
+    assert ((maps.position > at(14, 0.5, 0.1)) & (maps.position < at(24, 8.5, 4.1))).all(axis=1).any()
+
+
+def test_patches_that_no_light_arrives_at_do_not_count_unless_it_arrives_nowhere():
+    boxes = (0, 0, 0), (4, 4, 4), (6, 0, 0), (10, 4, 4)
+    walls = [build_scenes.box(*boxes[:2], inward=True), build_scenes.box(*boxes[2:], inward=True)]
+    material = Material("wall")
+    start = np.float32([[1, 3, 7, 9], [1, 2, 1, 2], [0.001] * 4])
+    patches = Patches(start, np.float32([[0] * 4, [0] * 4, [1] * 4]), np.ones(4, np.float32), np.ones(4, np.float32))
+    for strength, lit in ((1.0, [True, True, False, False]), (0.0, [True] * 4)):
+        lights = build_scenes.lamps({"position": (2, 2, 3), "strength": (strength,) * 3})
+        snapshot = build_scenes.snapshot([(np.concatenate(walls), material)], lights, sky=(0, 0, strength))
+        scene = prepare(snapshot, Model(sky="fixed"))
+        assert are_lit(scene, Effort(0), patches).tolist() == lit
+
+
 def test_a_large_scene_has_a_cache_for_each_cell(tmp_path, monkeypatch):
     snapshot, boxes = hall(4.2, 134.2), []
     bake(snapshot, tmp_path, SETTINGS)
@@ -189,7 +223,7 @@ def test_a_large_scene_has_a_cache_for_each_cell(tmp_path, monkeypatch):
     around = radiosity.around
     monkeypatch.setattr(radiosity, "around", lambda *a: boxes.append(a[2]) or around(*a))
     outside = at(300, 0, 1)
-    run(job_of(tmp_path, snapshot, cached=True, wish=Wish(5, spending=SPENDING, pinned=outside[None])))
+    run(job_of(tmp_path, snapshot, cached=True, wish=Wish(7, spending=SPENDING, pinned=outside[None])))
     maps = probe_file.load(tmp_path, folder.load_header(tmp_path))
     cells = np.unique(np.floor((maps.position[1:, 0] - ORIGIN[0]) / 128))
     assert cells.tolist() == [0, 1]
@@ -319,3 +353,33 @@ def test_without_probes_nothing_is_left_of_them(tmp_path):
     assert not sets_in(target)
     assert not (target / "probes.exr").exists()
     assert verify(target) == []
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_surface_caches_that_a_bake_finds_to_be_off_are_not_used_for_probes(tmp_path, monkeypatch, fails):
+    jobs = []
+    monkeypatch.setattr(cell_job, "WORTH", 0)
+    monkeypatch.setattr(cell_job.Check, "fails", lambda check, error: fails)
+    monkeypatch.setattr(probe_job, "run", lambda job, show: jobs.append(job) or Made(0, 0))
+    settings = dataclasses.replace(SETTINGS, method="cache")
+    bake(hall(0.2), tmp_path, settings, manner=Manner(threads=1, probes=Wish(1, spending=SPENDING)))
+    assert [job.cached for job in jobs] == [not fails]
+
+
+@pytest.mark.parametrize(("worth", "caches"), [(2 * 16 * 14 * 14, 1), (2 * 16 * 14 * 14 + 1, 0)])
+def test_a_surface_cache_is_made_for_as_many_rays_as_are_worth_it(target, monkeypatch, worth, caches):
+    made, around = [], radiosity.around
+    monkeypatch.setattr(probe_job, "WORTH", worth)
+    monkeypatch.setattr(radiosity, "around", lambda *a: made.append(a[2]) or around(*a))
+    run(job_of(target, hall(0.2), cached=True))  # three probes of 16 rays a texel
+    assert len(made) == caches
+
+
+def test_probes_of_a_scene_without_light_are_made_if_asked(tmp_path):
+    snapshot = dataclasses.replace(hall(0.2), lights=build_scenes.lamps())
+    settings = dataclasses.replace(SETTINGS, sky="0")
+    bake(snapshot, tmp_path, settings)
+    job = job_of(tmp_path, snapshot, scene=prepare(snapshot, Model()), mixture=np.zeros((0, 3)))
+    assert run(job).count == 3
+    assert probe_job.why_none(job) == "there is no light to reflect"
+    assert verify(tmp_path) == []
