@@ -21,6 +21,7 @@ from gi_volumes.tree.grid import choose
 from gi_volumes.tree.interpolate import DataPoints
 from gi_volumes.tree.payload import NO_DATA
 from gi_volumes.tree.probe_sets import WHOLE, ProbeSets, defect
+from gi_volumes.tree.reflections import Rays, Reflections
 
 GRAY = Material("gray", Channel((0.5,) * 3))
 ROOM_A, ROOM_B = np.array([[0, 0, 0], [4, 5, 3.0]]), np.array([[4.2, 0, 0], [9, 5, 3.0]])
@@ -162,3 +163,29 @@ def test_it_stops_when_asked_to():
     scene, data = with_door()
     with pytest.raises(CancelledError):
         see(scene, data, PROBES, Effort(0), lambda done: False)
+
+
+def test_reflections_show_their_own_room_and_the_other_one_through_the_door_alone():
+    """Room A shines red, room B blue; rays that end well away from the door's frame."""
+    scene, data = with_door()
+
+    def shine(place: np.ndarray) -> np.ndarray:
+        return np.where(place[:, :1] < 4.1, [[1.0, 0, 0]], [[0, 0, 1.0]])
+
+    maps = probe_worlds.traced(scene, PROBES, shine, 0.0, 64)
+    probes = Reflections(data, maps, [see(scene, data, PROBES, Effort(0))])
+    generator = np.random.default_rng(1)
+    point, direction = (
+        generator.uniform(ROOM_A[0] + 0.02, ROOM_A[1] - 0.02, (8000, 3)),
+        generator.normal(size=(8000, 3)),
+    )
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    distance, _ = probe_worlds.meet(scene, point, direction, shine, 0.0)
+    end = point + direction * distance[:, None]
+    rays = Rays(point, direction.astype(np.float32), np.zeros(8000), np.zeros((8000, 3), np.float32))
+    light, _ = probes.look(rays, probes.mixed({"local": np.ones((1, 3))}))
+    inside, through = end[:, 0] < 3.9, end[:, 0] > 5
+    assert light[inside, 2].mean() < 2e-3
+    assert (light[inside, 2] > 0.1).mean() < 2e-3
+    assert through.sum() > 50
+    assert light[through, 2].mean() > 0.5
