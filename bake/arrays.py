@@ -83,19 +83,52 @@ def read_array(path: Path) -> np.ndarray:
     OSError
         The file is missing or cannot be read.
     """
-    try:
-        # Mapped, so that no more memory is taken than the file has bytes, whatever its header says.
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except OSError:
-        raise
-    except Exception as error:  # numpy's reader of headers lets any error of Python's own parser through
-        raise SettingsError(f"{path}: not a .npy file of numbers ({one_line(error)})") from error
+    array = _mapped(path)
     if not isinstance(array, np.ndarray) or array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "fiu":
         raise SettingsError(f"{path}: want numbers of shape (n, 3)")
     array = np.array(array, np.float64)
     if not np.isfinite(array).all():
         raise SettingsError(f"{path}: row {int(np.argmax(~np.isfinite(array).all(axis=1)))} holds NaN or infinity")
     return array
+
+
+def read_roughness(path: Path) -> np.ndarray:
+    """Read one number from 0 to 1 for each ray.
+
+    Parameters
+    ----------
+    path : Path
+        A .npy file of (n,) numbers.
+
+    Returns
+    -------
+    (n,) float64 ndarray
+        As they are.
+
+    Raises
+    ------
+    SettingsError
+        The file holds something else.
+    OSError
+        The file is missing or cannot be read.
+    """
+    array = _mapped(path)
+    if not isinstance(array, np.ndarray) or array.ndim != 1 or array.dtype.kind not in "fiu":
+        raise SettingsError(f"{path}: want numbers of shape (n,)")
+    array = np.array(array, np.float64)
+    if not ((array >= 0) & (array <= 1)).all():
+        raise SettingsError(f"{path}: row {int(np.argmin((array >= 0) & (array <= 1)))} is not between 0 and 1")
+    return array
+
+
+def _mapped(path: Path) -> object:
+    """What a .npy file holds, mapped, so that no more memory is taken than it has bytes, whatever its header says."""
+    try:
+        return np.load(path, mmap_mode="r", allow_pickle=False)
+    except OSError:
+        raise
+    except Exception as error:  # numpy's reader of headers lets any error of Python's own parser through
+        raise SettingsError(f"{path}: not a .npy file of numbers ({one_line(error)})") from error
 
 
 def write_array(path: Path, array: np.ndarray) -> None:

@@ -22,7 +22,7 @@ import numpy as np
 from ..tree import container, verify, world
 from ..tree.topology import MAX_POINTS
 from . import job, probe_job, reference, snapshot_file, viewpoint
-from .arrays import check_output, one_line, read_points, write_array
+from .arrays import check_output, one_line, read_array, read_points, read_roughness, write_array
 from .capture import Spending
 from .place import SNAPSHOT_NAME, check_target, scene_defects
 from .probe_job import Wish
@@ -217,9 +217,14 @@ def _add_bake(commands) -> None:
 
 
 def _add_query(commands) -> None:
-    command = _add_command(commands, "query", "irradiance from a bake", _run_query, None)
+    command = _add_command(commands, "query", "irradiance from a bake, or radiance that rays meet", _run_query, None)
     command.add_argument("folder", type=_path, metavar="DIR")
-    _add_points(command)
+    _add_points(command, needs_normals=False)
+    text = (
+        "(n, 3) mirror directions: radiance from there, [W/(m2 sr)], instead of irradiance; --normals may be left out"
+    )
+    command.add_argument("--directions", type=_path, metavar="D.npy", help=text)
+    command.add_argument("--roughness", type=_path, metavar="R.npy", help="(n,) roughness, with --directions")
     command.add_argument("--sun", help="x,y,z towards the sun, instead of the scene's")
 
 
@@ -250,10 +255,10 @@ def _add_compare(commands) -> None:
     command.set_defaults(refuse=command.error)
 
 
-def _add_points(command: argparse.ArgumentParser) -> None:
+def _add_points(command: argparse.ArgumentParser, needs_normals: bool = True) -> None:
     """Where to measure, and where to write it."""
     command.add_argument("--points", type=_path, required=True, metavar="P.npy", help="(n, 3) points in metres")
-    command.add_argument("--normals", type=_path, required=True, metavar="N.npy", help="(n, 3) unit normals")
+    command.add_argument("--normals", type=_path, required=needs_normals, metavar="N.npy", help="(n, 3) unit normals")
     command.add_argument("-o", "--output", type=_path, required=True, metavar="E.npy")
     command.add_argument("--transport", choices=("local", "sun", "sky", "all"), default="all")
 
@@ -319,7 +324,9 @@ def _run_verify(options, extract: Extract, progress: Progress) -> dict:
 
 def _run_query(options, extract: Extract, progress: Progress) -> dict:
     check_output(options.output)
-    points, normals = read_points(options.points, options.normals)
+    _check_query(options)
+    points = read_array(options.points)
+    normals = None if options.normals is None else read_points(options.points, options.normals)[1]
     direction = None
     if options.sun is not None:
         direction = unit(numbers(options.sun, "--sun", (3,))[None], f"--sun {options.sun}")[0]
@@ -331,9 +338,23 @@ def _run_query(options, extract: Extract, progress: Progress) -> dict:
     if early:
         print(f"warning: {early} of {expected} cells are an early look, not baked to their end", file=sys.stderr)
     sun = None if direction is None else (direction, loaded.sun_irradiance)
-    values = loaded.irradiance(points, normals, sun=sun, transport=options.transport)
+    if options.directions is None:
+        values = loaded.irradiance(points, normals, sun=sun, transport=options.transport)
+    else:
+        directions = read_points(options.points, options.directions)[1]
+        values = loaded.radiance(points, directions, read_roughness(options.roughness), sun, normals=normals)
     write_array(options.output, values)
     return {"points": len(points), "output": str(options.output)}
+
+
+def _check_query(options) -> None:
+    """Refuse words that do not say what is asked for."""
+    if (options.directions is None) != (options.roughness is None):
+        raise SettingsError("--directions and --roughness: give both, or neither")
+    if options.directions is None and options.normals is None:
+        raise SettingsError("--normals: give them for irradiance, or --directions and --roughness for radiance")
+    if options.directions is not None and options.transport != "all":
+        raise SettingsError(f"--transport {options.transport}: not with --directions, which see all of them")
 
 
 def _run_reference(options, extract: Extract, progress: Progress) -> dict:

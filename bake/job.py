@@ -318,7 +318,8 @@ def _make_probes(work: Work, wish: Wish | None, missing: int, progress: Progress
         progress.stage("Probes", STEPS)
         return probe_job.run(job, lambda share: progress.show(int(share * STEPS))), ""
     if missing == 0 and probe_file.describe(target) is not None:
-        (target / probe_file.PROBES).unlink()
+        for path in (target / probe_file.PROBES, *target.glob("cell_*.probes")):
+            path.unlink()
         folder.list_again(target)
     return Made(0, 0), why
 

@@ -11,14 +11,15 @@ import functools
 import hashlib
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from ..tree import folder, probe_file, probe_maps
-from ..tree.cells import TREE, cell_path, read_tree
+from ..tree import folder, probe_cells, probe_file, probe_maps
+from ..tree.cells import TREE, cell_path, read_cell, read_tree
 from ..tree.grid import Grid
+from ..tree.interpolate import join
 from ..tree.probe_atlas import Layout
 from ..tree.topology import Topology
 from . import radiosity
@@ -27,6 +28,7 @@ from .gather import Effort
 from .glossiness import ROUGH, glossy_share
 from .lit_patches import are_lit
 from .patches import Forest
+from .probe_visibility import see
 from .probes import LEAST_GAIN, Request, place
 from .scene import Scene
 from .settings import ERRORS, Settings
@@ -36,8 +38,8 @@ __all__ = ["AUTOMATIC", "Job", "Made", "Wish", "probe_bytes", "run", "spending_o
 FORMAT = "gi_volumes probes 1"
 """Part of every file's hash: probes of another definition are captured anew."""
 
-PLACED, CACHED = 0.1, 0.1
-"""Parts of the progress that placing and the surface caches take."""
+PLACED, CACHED, SEEN = 0.1, 0.1, 0.05
+"""Parts of the progress that placing and the surface caches take, and finding out which probes count where."""
 
 WORTH = 1 << 23
 """Rays of a cell's probes below which paths are followed to their end. A surface cache takes 4 to 17 s, and saves a
@@ -190,16 +192,38 @@ def run(job: Job, show: Callable[[float], bool] = lambda share: True) -> Made:
     trees = tuple(_trees(job.target, header))
     made = _digest(job, trees)
     if probe_file.made_of(job.target, header["bake"]) == made:
-        listed = folder.list_again(job.target)["probes"]
-        return Made(len(listed["positions"]), listed["file"]["bytes"], kept=True)
+        found = Made(0, 0, kept=True)
+    else:
+        found = _capture(job, trees, header["bake"], made, _part_of(show, 0, 1 - SEEN))
+    _see_all(job, header, made, _part_of(show, 1 - SEEN, SEEN))
+    listed = folder.list_again(job.target)["probes"]
+    return replace(found, count=len(listed["positions"]), bytes=listed["file"]["bytes"])
+
+
+def _capture(job: Job, trees: tuple[Topology, ...], bake: str, made: str, show: Callable[[float], bool]) -> Made:
+    """Place probes, and write what they see."""
     placed = place(job.scene, Forest(job.grid, trees), _request(job), job.effort, _part_of(show, 0, PLACED))
     maps = probe_maps.empty(placed.position + job.scene.origin, placed.pinned, job.wish.spending.pitch, job.parts)
     studio = Studio.of(maps, job.mixture, job.wish.spending, job.effort)
     _shoot_all(job, studio, trees, _part_of(show, PLACED, 1 - PLACED))
-    probe_file.write(job.target, maps, header["bake"], made)
-    size = folder.list_again(job.target)["probes"]["file"]["bytes"]
+    probe_file.write(job.target, maps, bake, made)
     rays, noise = (part if len(part) else np.zeros(1) for part in (studio.rays, studio.noise))
-    return Made(len(placed.position), size, placed.reason, False, float(rays.mean()), float(np.sqrt((noise**2).mean())))
+    return Made(0, 0, placed.reason, False, float(rays.mean()), float(np.sqrt((noise**2).mean())))
+
+
+def _see_all(job: Job, header: dict, made: str, show: Callable[[float], bool]) -> None:
+    """Write which probes count where, for cells that do not say so yet."""
+    place = probe_file.read(job.target / probe_file.PROBES)[0].position - job.scene.origin
+    cells = [tuple(entry["cell"]) for entry in header["cells"] if not entry.get("early")]
+    for number, name in enumerate(cells):
+        if probe_cells.is_of(probe_cells.path_of(job.target, name), header["bake"], made):
+            continue
+        cell = read_cell(job.target, name)
+        data = join(job.grid, [cell.topology], cell.offset, cell.valid)
+        part = _part_of(show, number / len(cells), 1 / len(cells))
+        count = max(int(cell.valid.sum()), 1)
+        sets = see(job.scene, data, place, job.effort, lambda done, part=part, count=count: part(done / count))
+        probe_cells.write(job.target, cell, sets, made)
 
 
 def probe_bytes(pitch: int, parts: int) -> int:

@@ -11,14 +11,14 @@ stands in for voxels without one. The ramp keeps the value continuous where the 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
 from .interpolate import PAIRS, DataPoints, last_resort, layers
 from .stencil import Taps, in_order, pick
 
-__all__ = ["ENOUGH", "blend", "clamp"]
+__all__ = ["ENOUGH", "blend", "clamp", "shares"]
 
 ENOUGH = 0.002
 """Weights that sum to less are filled up. A corner of a room that lies on the voxel grid has 0.009: its own data points
@@ -50,24 +50,48 @@ def blend(data: DataPoints, values: np.ndarray, points: np.ndarray, normals: np.
     (n, m) float32
         Weighted means; zeros in a bake without any valid data point.
     """
+    result = np.zeros((len(points), values.shape[1]), np.float32)
+    for part in shares(data, points, normals) if values.size else ():
+        _add(result, values, *part)
+    return result
+
+
+def shares(
+    data: DataPoints, points: np.ndarray, normals: np.ndarray, resort: bool = True
+) -> Iterator[tuple[np.ndarray, ...]]:
+    """Find out which data points count around points, and how much each does.
+
+    Parameters
+    ----------
+    data, points, normals
+        As for `blend`.
+    resort : bool
+        Whether the last resort counts, which does not know of walls.
+
+    Yields
+    ------
+    to : (m,) int64 ndarray
+        Some of the points, each once.
+    row : (8, m) int64 ndarray
+        Data points.
+    weight : (8, m) float32 ndarray
+        Parts of the points' values that are theirs; over all that is yielded they sum to 1 for a point, less what
+        is held back and shaded, in a bake with any valid data point.
+    """
     points, normals = np.ascontiguousarray(points.T), np.ascontiguousarray(normals.T, np.float32)
     count = points.shape[1]
-    result, share = np.zeros((count, values.shape[1]), np.float32), np.ones(count, np.float32)
-    if not values.size:
-        return result
-    due = np.full(count, data.grid.levels - 1)
+    share, due = np.ones(count, np.float32), np.full(count, data.grid.levels - 1)
     for level in range(data.grid.levels - 1, -1, -1):
         some = np.flatnonzero(due == level)
         found = list(layers(data, pick(points, some), pick(normals, some), level))
         total, start = _trust(found, len(some))
         left = np.maximum(np.float32(ENOUGH) - total, 0) / np.float32(ENOUGH)
         left **= (level - start + 1).astype(np.float32)
-        _add(result, values, found, some, pick(share, some) * (1 - left) / np.where(total > 0, total, 1))
+        yield from _scaled(found, some, pick(share, some) * (1 - left) / np.where(total > 0, total, 1))
         due[some] = np.where(left > 0, start - 1, DONE)
         share[some] *= _hold_back(data, found, start, left)
-    some = np.flatnonzero(due > DONE)
-    _add(result, values, last_resort(data, pick(points, some)), some, share[some])
-    return result
+    some = np.flatnonzero(due > DONE) if resort else due[:0]
+    yield from _scaled(last_resort(data, pick(points, some)), some, share[some])
 
 
 def clamp(data: DataPoints, points: np.ndarray) -> np.ndarray:
@@ -120,15 +144,19 @@ def _hold_back(data: DataPoints, found: list[Taps], start: np.ndarray, left: np.
     return left
 
 
-def _add(result: np.ndarray, values: np.ndarray, found: Iterable[Taps], some: np.ndarray, scale: np.ndarray) -> None:
-    """Add weighted values of taps to some points' results, in blocks that stay in the processor's cache."""
-    step, whole = max(1, BLOCK // values.shape[1]), np.dtype((np.void, result.itemsize * result.shape[1]))
+def _scaled(found: Iterable[Taps], some: np.ndarray, scale: np.ndarray) -> Iterator[tuple[np.ndarray, ...]]:
+    """Taps of some points as `shares` yields them, their weights scaled."""
     for taps in found:
-        weight, to = taps.weight * pick(scale, taps.point), pick(some, taps.point)
-        for start in range(0, len(to), step):
-            part = slice(start, start + step)
-            row = np.ascontiguousarray(taps.row[:, part].T)
-            read = values.take(row.reshape(-1), axis=0, mode="clip").reshape(*row.shape, -1)
-            mean = np.matmul(np.ascontiguousarray(weight[:, part].T)[:, None], read)[:, 0]
-            mean += result.take(to[part], axis=0, mode="clip")
-            np.put(result.view(whole), to[part], mean.view(whole), mode="clip")
+        yield pick(some, taps.point), taps.row, taps.weight * pick(scale, taps.point)
+
+
+def _add(result: np.ndarray, values: np.ndarray, to: np.ndarray, rows: np.ndarray, weight: np.ndarray) -> None:
+    """Add weighted values of data points to some points' results, in blocks that stay in the processor's cache."""
+    step, whole = max(1, BLOCK // values.shape[1]), np.dtype((np.void, result.itemsize * result.shape[1]))
+    for start in range(0, len(to), step):
+        part = slice(start, start + step)
+        row = np.ascontiguousarray(rows[:, part].T)
+        read = values.take(row.reshape(-1), axis=0, mode="clip").reshape(*row.shape, -1)
+        mean = np.matmul(np.ascontiguousarray(weight[:, part].T)[:, None], read)[:, 0]
+        mean += result.take(to[part], axis=0, mode="clip")
+        np.put(result.view(whole), to[part], mean.view(whole), mode="clip")

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from . import probe_cells
 from .atomic import write_bytes_atomically
 from .cells import (
     TREE,
@@ -55,7 +56,7 @@ WORLD_FORMAT = "gi_volumes world"
 WORLD_VERSION = 2
 MAX_WORLD_BYTES = 1 << 28
 """A `world.json` of a million cells; anything longer is not one."""
-FILE_NAME = re.compile(r"cell_(-?\d+)_(-?\d+)\.(tree|points|local|sun|sky)")
+FILE_NAME = re.compile(r"cell_(-?\d+)_(-?\d+)\.(tree|points|local|sun|sky|probes)")
 
 
 def assemble(folder: str | os.PathLike, header: dict) -> dict:
@@ -82,7 +83,8 @@ def assemble(folder: str | os.PathLike, header: dict) -> dict:
     OSError
         When the folder cannot be read or written.
     """
-    grid = header["grid"]
+    grid, probes = header["grid"], describe(folder) or {}
+    made = probes["made"] if probes.get("bake") == header["bake"] else None
     cells = []
     for cell in _cells_in(folder):
         try:
@@ -90,13 +92,12 @@ def assemble(folder: str | os.PathLike, header: dict) -> dict:
         except FileError:
             continue
         if meta.get("bake") == header["bake"] and topology.cell == cell:
-            cells.append(_describe_cell(folder, topology, meta, grid))
+            cells.append(_describe_cell(folder, topology, meta, grid, made))
     lattice = dataclasses.asdict(grid) | {"cell_size": grid.cell_size, "unit": "m"}
     content = header | {"format": WORLD_FORMAT, "version": WORLD_VERSION, "grid": lattice, "cells": cells}
     content["bounds"] = _bounds([entry["bounds"] for entry in cells])
-    probes = describe(folder) or {}
     content.pop("probes", None)
-    content |= {"probes": probes} if probes.get("bake") == header["bake"] else {}
+    content |= {} if made is None else {"probes": probes}
     content = json.loads(json.dumps(content, allow_nan=False))
     content["checksum"] = _checksum(content)
     write_bytes_atomically(Path(folder) / WORLD, _to_text(content))
@@ -223,11 +224,14 @@ def _cells_in(folder: str | os.PathLike) -> list[tuple[int, int]]:
     return sorted({(int(match[1]), int(match[2])) for match in names if match and match[3] == TREE})
 
 
-def _describe_cell(folder: str | os.PathLike, topology: Topology, meta: dict, grid: Grid) -> dict:
-    """A cell's entry in `world.json`."""
+def _describe_cell(folder: str | os.PathLike, topology: Topology, meta: dict, grid: Grid, made: str | None) -> dict:
+    """A cell's entry in `world.json`; `made` says what the bake's probes were made of, if it has any."""
     low = np.array(topology.grid_min) * grid.first_size + grid.origin
     high = low + np.array(topology.grid_shape) * grid.first_size
     listed = meta["files"] | {TREE: describe_file(cell_path(folder, topology.cell, TREE))}
+    seen = probe_cells.path_of(folder, topology.cell)
+    if made is not None and probe_cells.is_of(seen, meta["bake"], made):
+        listed["probes"] = describe_file(seen)
     keys = ("data_points", "valid_points", "left_out")
     entry = {"cell": list(topology.cell), "bounds": [low.tolist(), high.tolist()], "files": listed}
     entry |= {key: meta[key] for key in keys} | {"dilated": meta.get("dilated", 0)}

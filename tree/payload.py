@@ -22,6 +22,7 @@ __all__ = [
     "KIND",
     "NO_DATA",
     "Payload",
+    "distinct",
     "encode",
     "read_payload",
     "write_payload",
@@ -136,7 +137,7 @@ def encode(values: np.ndarray, valid: np.ndarray, goal: Goal, name: str = "paylo
     kept = values[valid].astype(np.float32)
     gain = np.array(SKY_GAIN if (name, values.shape[1]) == ("sky", len(SKY_GAIN)) else [0] * values.shape[1], np.int8)
     coded = transform.encode(kept, gain, goal)
-    first, rank = _distinct(np.concatenate([coded.exponent[:, None], coded.coefficient], axis=1))
+    first, rank = distinct(np.concatenate([coded.exponent[:, None], coded.coefficient], axis=1))
     if len(first) > NO_DATA:
         raise ValueError(f"{name}: {len(first)} distinct entries; 16 bits number at most {NO_DATA}")
     index = np.full(len(values), NO_DATA, np.uint16)
@@ -285,8 +286,21 @@ def _bound(values: np.ndarray, rank: np.ndarray, table: Coded) -> float:
     return float(np.float32(worst * (1 + MARGIN) + MARGIN))
 
 
-def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """First row of each distinct one, in order of appearance, and for each row the number of its like."""
+def distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Find equal rows.
+
+    Parameters
+    ----------
+    rows : (n, k) ndarray
+        Equal where all bytes are.
+
+    Returns
+    -------
+    first : (m,) int64 ndarray
+        First row of each distinct one, in the order of first use.
+    rank : (n,) int64 ndarray
+        For each row the number of its like in `first`.
+    """
     if not len(rows):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     keys = np.ascontiguousarray(rows).view(np.dtype((np.void, rows.shape[1] * rows.itemsize))).ravel()

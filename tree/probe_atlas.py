@@ -18,7 +18,7 @@ import numpy as np
 
 from . import octahedral
 
-__all__ = ["BORDER", "SMALLEST_PITCH", "Layout", "fetch", "put"]
+__all__ = ["BORDER", "SMALLEST_PITCH", "Layout", "fetch", "fetch_between", "put"]
 
 BORDER = 1
 """Texels around each map, on every level: what bilinear look-ups reach."""
@@ -199,6 +199,45 @@ def fetch(atlas: np.ndarray, layout: Layout, level: int, probe: np.ndarray, dire
     column, row = column + base[:, 0], row + base[:, 1]
     a, b, c, d = (atlas[row + y, column + x].astype(kind) for y in (0, 1) for x in (0, 1))
     return _mix(_mix(a, b, u), _mix(c, d, u), v)
+
+
+def fetch_between(
+    levels: tuple[np.ndarray, ...], layout: Layout, level: np.ndarray, probe: np.ndarray, direction: np.ndarray
+) -> np.ndarray:
+    """Look up directions on the two levels around a number, mixed by its fraction.
+
+    Parameters
+    ----------
+    levels : tuple of (rows_l, columns_l, channels) ndarray
+        Of the atlas.
+    layout : Layout
+        Where tiles lie.
+    level : (n,) float ndarray
+        0 to the number of levels less 1.
+    probe : (n,) int64 ndarray
+        Numbers of probes.
+    direction : (n, 3) ndarray
+        Vectors of any length.
+
+    Returns
+    -------
+    (n, channels) float32 ndarray
+        Continuous in level and direction.
+
+    Raises
+    ------
+    IndexError
+        There is no such tile.
+    """
+    below = np.floor(level).astype(np.int64)
+    part = (level - below).astype(np.float32)[:, None]
+    found = np.zeros((len(probe), levels[0].shape[2]), np.float32)
+    for number, atlas in enumerate(levels):
+        for is_meant, share in ((below == number, 1 - part), (below == number - 1, part)):
+            some = np.flatnonzero(is_meant & (share[:, 0] > 0))
+            if len(some):
+                found[some] += share[some] * fetch(atlas, layout, number, probe[some], direction[some])
+    return found
 
 
 def _mix(a: np.ndarray, b: np.ndarray, t: np.ndarray) -> np.ndarray:

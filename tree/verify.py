@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from . import folder, probe_file
+from . import folder, probe_cells, probe_file
 from .cells import cell_path, describe_file
 from .container import FileError
 
@@ -65,7 +65,7 @@ def _defects(path: Path, header: dict) -> Iterator[Defect]:
     """Cell by cell, then what should be there and is not, then the probes."""
     listed = {tuple(entry["cell"]) for entry in header["cells"]}
     for entry in header["cells"]:
-        yield from _cell_defects(path, entry, header["bake"])
+        yield from _cell_defects(path, entry, header)
         if entry.get("early"):
             what = f"cell {entry['cell'][0]},{entry['cell'][1]} is an early look: not baked to its end yet"
             yield Defect(cell_path(path, entry["cell"], "tree").name, what)
@@ -76,9 +76,13 @@ def _defects(path: Path, header: dict) -> Iterator[Defect]:
         probe_file.load(path, header)
     except (OSError, FileError) as error:
         yield Defect(probe_file.PROBES, _reason(error))
+    for entry in header["cells"] if "probes" in header else ():
+        if "probes" not in entry["files"]:
+            what = f"cell {entry['cell'][0]},{entry['cell'][1]} does not say which probes count where"
+            yield Defect(probe_cells.path_of(path, entry["cell"]).name, what)
 
 
-def _cell_defects(path: Path, entry: dict, bake: str) -> Iterator[Defect]:
+def _cell_defects(path: Path, entry: dict, header: dict) -> Iterator[Defect]:
     """Files against their hashes; when these fit, the cell against its invariants."""
     broken = False
     for file in entry["files"].values():
@@ -94,7 +98,11 @@ def _cell_defects(path: Path, entry: dict, bake: str) -> Iterator[Defect]:
     except (OSError, FileError) as error:
         yield Defect(Path(getattr(error, "path", tree)).name, _reason(error))
         return
-    if cell.meta["bake"] != bake:
+    try:
+        probe_cells.load(path, header | {"cells": [entry]}, [cell])
+    except (OSError, FileError) as error:
+        yield Defect(Path(getattr(error, "path", tree)).name, _reason(error))
+    if cell.meta["bake"] != header["bake"]:
         yield Defect(tree, "the cell belongs to another bake than world.json")
     if cell.topology.size != entry["data_points"]:
         yield Defect(tree, f"{cell.topology.size} data points; world.json says {entry['data_points']}")

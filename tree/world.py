@@ -1,4 +1,4 @@
-"""A bake, loaded: irradiance at any point for any normal. This is the definition of what the files mean.
+"""A bake, loaded: irradiance at any point for any normal, and radiance that rays meet: what the files mean.
 
     E(p, n) = E_local(p, n) + E_sun(p, n; sun direction) * sun irradiance + E_sky(p, n; sky radiance)   [W/m2]
 
@@ -9,27 +9,30 @@ three terms is clamped at 0 by itself, so that they add up whether they are aske
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 
 import numpy as np
 
-from . import folder, harmonics, planes
+from . import folder, harmonics, planes, probe_cells, probe_file
 from .blend import blend, clamp
 from .container import FileError
 from .grid import Grid
 from .interpolate import DataPoints, join
 from .lookup import Atlas
-from .suns import SunKeys
+from .probe_maps import ProbeMaps
+from .probe_sets import ProbeSets
+from .reflections import Rays, Reflections
+from .sources import TRANSPORTS, Sources
 from .values import Values
 
 __all__ = ["TRANSPORTS", "World", "load"]
 
-TRANSPORTS = ("all", "local", "sun", "sky")
-FIXED_SUN = np.radians(1.0)
-"""How far from a baked direction a fixed sun may be asked for [rad]: two disks of the sun."""
 LARGEST = np.finfo(np.float32).max / 100
 """Limit of coefficients, so that no sum of them overflows."""
 CHUNK = 1 << 16
 """Points handled at a time: few enough for some 50 MB, so many that calls cost little."""
+RAYS = 1 << 14
+"""Rays handled at a time, each with a dozen probes: some 100 MB."""
 REMEMBERED = 4
 """Combinations of transports, sun and sky whose coefficients are kept for the next look-up."""
 
@@ -43,6 +46,10 @@ class World:
         Content of `world.json`.
     cells : list of Cell
         All cells of the bake.
+    maps : ProbeMaps, optional
+        What its reflection probes see.
+    sets : sequence of ProbeSets
+        Which of them count where, of each cell; there are none without probes.
 
     Attributes
     ----------
@@ -54,24 +61,27 @@ class World:
         World cells (i, j) that are there.
     """
 
-    def __init__(self, header: dict, cells: list[folder.Cell]):
+    def __init__(
+        self,
+        header: dict,
+        cells: list[folder.Cell],
+        maps: ProbeMaps | None = None,
+        sets: Sequence[ProbeSets] = (),
+    ):
         self.header, self.grid = header, folder.grid_of(header)
         self.cells = np.array([cell.topology.cell for cell in cells], np.int64).reshape(-1, 2)
         self._data = _data_points(self.grid, cells)
         names = [name for name in TRANSPORTS[1:] if any(name in cell.payloads for cell in cells)]
         self._values = {name: _join(name, cells, self._data.atlas) for name in names}
-        sun = header.get("transports", {}).get("sun") or {}
-        self._keys = SunKeys(np.array(sun["directions"])) if sun.get("directions") else None
+        functions = {name: values.functions for name, values in self._values.items()}
+        self._sources = Sources(header.get("transports", {}), functions)
         self._remembered: dict[tuple, np.ndarray] = {}
-        self._sun_is_free = bool(sun.get("free", True))
-        own = sun.get("scene") or []
-        self._own_direction = np.array([entry["direction"] for entry in own], np.float64).reshape(-1, 3)
-        self._own_irradiance = np.array([entry["irradiance"] for entry in own], np.float64).reshape(-1, 3)
+        self._reflections = Reflections(self._data, maps, sets) if maps is not None and len(maps.position) else None
 
     @property
     def sun_irradiance(self) -> np.ndarray:
         """(3,) float64 irradiance of the scene's own suns together, on surfaces that face them [W/m2]."""
-        return self._own_irradiance.sum(axis=0) if len(self._own_irradiance) else np.ones(3)
+        return self._sources.sun_irradiance
 
     def irradiance(
         self,
@@ -117,18 +127,94 @@ class World:
         points, normals = _check_rows(points, "points"), _check_rows(normals, "normals")
         if len(points) != len(normals):
             raise ValueError(f"{len(points)} points and {len(normals)} normals; as many are needed")
-        values = self._folded(self._factors(sun, sky, transport))
+        values = self._folded(self._sources.factors(sun, sky, transport))
         result = np.zeros((len(points), 3), np.float32)
         for start in range(0, len(points), CHUNK):
             part = slice(start, start + CHUNK)
             result[part] = self._evaluate(points[part], normals[part], values)
         return result
 
+    def radiance(
+        self,
+        points: np.ndarray,
+        directions: np.ndarray,
+        roughness: np.ndarray | float,
+        sun: tuple | None = None,
+        sky: np.ndarray | float | None = None,
+        normals: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Return the radiance that rays meet, blurred by a lobe about them: what a surface there mirrors.
+
+        Parameters
+        ----------
+        points : (n, 3) float64
+            World space [m]; anywhere, also outside the bake.
+        directions : (n, 3) float
+            Away from the points, of any length but 0: the mirror directions.
+        roughness : float or (n,) float
+            0 to 1; the lobe is that of `ggx.density`.
+        sun, sky
+            As for `irradiance`.
+        normals : (n, 3) float, optional
+            Of the surfaces that the points lie on, of any length; without them, or where they are zero, a wall
+            without thickness does not hide what lies behind it.
+
+        Returns
+        -------
+        (n, 3) float32
+            Radiance [W/(m2 sr)], finite and not negative. Where no probe sees what a ray meets it is the irradiance of
+            a surface that faces along the ray, over pi: as of a lobe as wide as a cosine.
+
+        Raises
+        ------
+        ValueError
+            For wrong shapes, input that is not finite, roughness out of range, a direction of no length, a sun or a
+            sky that the bake cannot represent.
+
+        Notes
+        -----
+        Error: see `docs/accuracy.md`. Continuous along a moving point, in direction and in roughness.
+        Source: the talk's rows 3 and 4.
+        """
+        normals = np.zeros_like(directions) if normals is None else normals
+        points, directions, normals = (
+            _check_rows(*pair) for pair in ((points, "points"), (directions, "directions"), (normals, "normals"))
+        )
+        roughness = _check_roughness(roughness, len(points))
+        if not len(points) == len(directions) == len(normals) == len(roughness):
+            counts = f"{len(directions)} directions, {len(normals)} normals, {len(roughness)} numbers of roughness"
+            raise ValueError(f"{len(points)} points, {counts}; as many are needed")
+        if not directions.any(axis=1).all():
+            raise ValueError(f"directions: row {int(np.argmin(directions.any(axis=1)))} has no length")
+        factors, result = self._sources.factors(sun, sky, "all"), np.zeros((len(points), 3), np.float32)
+        points = clamp(self._data, self.grid.to_local(points))
+        directions, normals = (_unit(rows).astype(np.float32) for rows in (directions, normals))
+        for start in range(0, len(points), RAYS):
+            part = slice(start, start + RAYS)
+            rays = Rays(points[part], directions[part], roughness[part], normals[part])
+            result[part] = self._reflect(rays, factors)
+        return result
+
+    def _reflect(self, rays: Rays, factors: dict[str, np.ndarray]) -> np.ndarray:
+        """One chunk: what probes see, and what irradiance says where they see nothing."""
+        light, seen = np.zeros((len(rays.point), 3), np.float32), np.zeros(len(rays.point), np.float32)
+        if self._reflections is not None:
+            light, seen = self._reflections.look(rays, self._reflections.mixed(factors))
+        some = np.flatnonzero(seen < 1)
+        facing = np.where(rays.normal[some].any(axis=1, keepdims=True), rays.normal[some], rays.direction[some])
+        other = self._toward(rays.point[some], facing, rays.direction[some], self._folded(factors)) / np.float32(np.pi)
+        light[some] = seen[some, None] * light[some] + (1 - seen[some, None]) * other
+        return light
+
     def _evaluate(self, points: np.ndarray, normals: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """One chunk: the mean coefficients of all transports at once, then each along the normals."""
-        points, normals = clamp(self._data, self.grid.to_local(points)), _unit(normals)
-        functions = harmonics.basis(normals)
-        functions[:, 6] *= np.any(normals.T, axis=0)  # of no direction; the others are 0 there, but the constant
+        """One chunk of points in world space."""
+        normals = _unit(normals)
+        return self._toward(clamp(self._data, self.grid.to_local(points)), normals, normals, values)
+
+    def _toward(self, points: np.ndarray, normals: np.ndarray, facing: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """The mean coefficients of all transports at once, by the surfaces' normals, then each along what they face."""
+        functions = harmonics.basis(facing)
+        functions[:, 6] *= np.any(facing.T, axis=0)  # of no direction; the others are 0 there, but the constant
         mean = blend(self._data, values, points, normals)
         total = np.zeros((len(points), 3), np.float32)
         for first in range(0, mean.shape[1], 27):
@@ -146,69 +232,6 @@ class World:
             folded = np.concatenate([np.zeros((len(self._data.valid), 0), np.float32), *parts], axis=1)
             self._remembered[key] = np.clip(folded, -LARGEST, LARGEST, out=folded)
         return self._remembered[key]
-
-    def _factors(self, sun: tuple | None, sky: np.ndarray | float | None, transport: str) -> dict[str, np.ndarray]:
-        """(K, 3) factors of the functions of each transport that counts."""
-        if transport not in TRANSPORTS:
-            raise ValueError(f"transport {transport!r}; one of {', '.join(TRANSPORTS)} is needed")
-        sun_factor, sky_factor = self._sun_factor(sun, transport == "sun"), self._sky_factor(sky)
-        chosen = {"local": np.ones((1, 3)), "sun": sun_factor, "sky": sky_factor}
-        return {k: v for k, v in chosen.items() if k in self._values and transport in ("all", k)}
-
-    def _sun_factor(self, sun: tuple | None, per_unit: bool) -> np.ndarray | None:
-        """Weights of the sun keys; relative to the suns' irradiance if asked for."""
-        if sun is None:
-            direction, irradiance = self._own_direction, self._own_irradiance
-        else:
-            if not isinstance(sun, tuple | list) or len(sun) != 2 or np.size(sun[0]) % 3:
-                raise ValueError("sun is a pair of direction and irradiance: ((x, y, z), 2.0)")
-            direction = _finite(sun[0], "sun direction").reshape(-1, 3)
-            irradiance = np.broadcast_to(_finite(sun[1], "sun irradiance"), (len(direction), 3))
-            self._check_sun(direction)
-        if (irradiance < 0).any():
-            raise ValueError("the sun's irradiance is negative")
-        if "sun" not in self._values or self._keys is None:
-            return None
-        if per_unit and not len(direction):
-            raise ValueError("the bake has no sun of its own; name its direction")
-        if per_unit:
-            total = irradiance.sum(axis=0)
-            irradiance = np.where(total > 0, irradiance / np.where(total > 0, total, 1.0), 1.0 / len(direction))
-        index, weight = self._keys.interpolate(direction)
-        factor = np.zeros((len(self._keys.directions), 3))
-        for corner in range(3):
-            for channel in range(3):
-                part = weight[:, corner] * irradiance[:, channel]
-                factor[:, channel] += np.bincount(index[:, corner], part, len(factor))
-        return factor
-
-    def _check_sun(self, direction: np.ndarray) -> None:
-        """A bake of fixed suns knows no other direction; to answer as if it did would be a guess."""
-        if self._sun_is_free or self._keys is None or not len(direction):
-            return
-        length = np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), np.finfo(np.float64).tiny)
-        nearest = (direction / length @ self._keys.directions.T).max(axis=1)
-        if (nearest < np.cos(FIXED_SUN)).any():
-            known = "; ".join(",".join(f"{value:.3g}" for value in key) for key in self._keys.directions)
-            raise ValueError(
-                f"the bake holds the sun at {known} only; bake with --sun hemisphere or arc:FILE to move it"
-            )
-
-    def _sky_factor(self, sky: np.ndarray | float | None) -> np.ndarray | None:
-        """Weights of the sky's functions."""
-        values = self._values.get("sky")
-        given = None if sky is None else _finite(sky, "sky")
-        if values is None:
-            return None
-        count = values.functions
-        own = self.header["transports"]["sky"].get("radiance") if count > 1 else [[1.0, 1.0, 1.0]]
-        if given is None:
-            return np.array(own, np.float64)
-        if given.shape in ((), (1,), (3,)):
-            return np.array(own, np.float64) * given
-        if given.shape != (count, 3) or count == 1:
-            raise ValueError(f"a sky of shape {given.shape}; this bake takes a factor" + " or (9, 3)" * (count > 1))
-        return given
 
 
 def load(path: str | os.PathLike) -> World:
@@ -239,7 +262,7 @@ def load(path: str | os.PathLike) -> World:
             name = f"cell_{entry['cell'][0]}_{entry['cell'][1]}.tree"
             raise FileError(os.path.join(path, name), 0, "this cell is of another bake than world.json")
         cells.append(cell)
-    return World(header, cells)
+    return World(header, cells, probe_file.load(path, header), probe_cells.load(path, header, cells))
 
 
 def _data_points(grid: Grid, cells: list[folder.Cell]) -> DataPoints:
@@ -275,12 +298,13 @@ def _check_rows(values: np.ndarray, what: str) -> np.ndarray:
     return values
 
 
-def _finite(value: object, what: str) -> np.ndarray:
-    """A finite float64 array."""
-    value = np.asarray(value, np.float64)
-    if not np.isfinite(value).all():
-        raise ValueError(f"the {what} is not finite")
-    return value
+def _check_roughness(values: np.ndarray | float, count: int) -> np.ndarray:
+    """(n,) float64 from 0 to 1."""
+    values = np.asarray(values, np.float64)
+    values = np.full(count, values) if values.ndim == 0 else values
+    if values.ndim != 1 or not ((values >= 0) & (values <= 1)).all():
+        raise ValueError("roughness is a number from 0 to 1, or one for each point")
+    return values
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

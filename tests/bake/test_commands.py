@@ -14,6 +14,7 @@ import pytest
 from command_line import QUICK, SUN, Points, call, cells_only, ground_points, stored, succeed, yard
 from gi_volumes.bake import snapshot_file
 from gi_volumes.bake.job import STEPS
+from gi_volumes.tree import world
 from gi_volumes.tree.folder import load_header
 from gi_volumes.tree.suns import SunKeys
 
@@ -529,3 +530,24 @@ def test_the_triangles_of_a_free_sun_are_those_that_a_look_up_takes(baked_hemisp
     sun = load_header(baked_hemisphere)["transports"]["sun"]
     assert sun["triangles"] == SunKeys(np.array(sun["directions"])).triangles.tolist()
     assert len(sun["triangles"]) > 10
+
+
+def test_query_gives_radiance_along_directions(level, points, tmp_path):
+    """A bake without probes answers from its volume: straight up what a surface that faces up gets, over pi."""
+    folder, count = tmp_path / "out", len(np.load(points.words[1]))
+    succeed("bake", level, "-o", folder, *QUICK)
+    up, rough, found = (tmp_path / name for name in ("up.npy", "rough.npy", "found.npy"))
+    np.save(up, np.tile([0.0, 0, 2], (count, 1)))
+    np.save(rough, np.full(count, 0.3))
+    words = ("--points", points.words[1], "--directions", up)
+    succeed("query", folder, *words, "--roughness", rough, "-o", found)
+    expected = world.load(folder).irradiance(np.load(points.words[1]), np.load(up)) / np.pi
+    np.testing.assert_allclose(np.load(found), expected, rtol=1e-5)
+    assert "give both" in call("query", folder, *words, "-o", found).reason
+    assert "--normals: give them" in call("query", folder, *words[:2], "-o", found).reason
+    more = (*words, "--roughness", rough, "-o", found)
+    assert "not with --directions" in call("query", folder, *more, "--transport", "sky").reason
+    np.save(rough, np.full(count, 1.5))
+    assert "row 0 is not between 0 and 1" in call("query", folder, *more).reason
+    np.save(rough, np.full((count, 1), 0.5))
+    assert "of shape (n,)" in call("query", folder, *more).reason

@@ -26,7 +26,7 @@ from gi_volumes.bake.scene import Model, prepare
 from gi_volumes.bake.settings import Settings, model
 from gi_volumes.bake.snapshot import Channel, Material, ProbeEdits, Snapshot
 from gi_volumes.bake.survey import Judge
-from gi_volumes.tree import folder, probe_file
+from gi_volumes.tree import container, folder, probe_cells, probe_file, world
 from gi_volumes.tree.verify import verify
 
 SETTINGS = Settings(samples=2, bounces=3, error=0.0, finest=2.0, sky="0.5,0.6,0.9")
@@ -331,6 +331,71 @@ def test_words_that_make_no_sense_are_wrong_usage(tmp_path, words, why):
     said = call("bake", tmp_path / "scene.giv", "-o", tmp_path / "bake", *words)
     assert said.code == 2
     assert why in said.err
+
+
+def sets_in(target: Path) -> dict[str, bytes]:
+    """Files that say which probes count where."""
+    return {path.name: path.read_bytes() for path in target.glob("cell_*.probes")}
+
+
+def test_each_cell_says_which_probes_count_where(target):
+    run(job_of(target, hall(0.2)))
+    header = folder.load_header(target)
+    assert [entry["files"]["probes"]["name"] for entry in header["cells"]] == sorted(sets_in(target))
+    cells = [folder.read_cell(target, tuple(entry["cell"])) for entry in header["cells"]]
+    sets = probe_cells.load(target, header, cells)
+    assert sum(
+        int(part.weight[part.index[cell.valid]].any(axis=1).sum()) for part, cell in zip(sets, cells, strict=True)
+    )
+
+
+def test_a_loaded_bake_reflects_what_its_probes_see(target):
+    """A mirror that looks up shows the sky of the bake, at its factor."""
+    run(job_of(target, hall(0.2), wish=Wish(6, spending=dataclasses.replace(SPENDING, pitch=64))))
+    loaded = world.load(target)
+    point = np.array([at(3, 3, 1.5), at(6, 5, 2), at(8, 4, 1)])
+    up = loaded.radiance(point, np.tile([0.0, 0, 1], (3, 1)), 0.1)
+    np.testing.assert_allclose(up, np.tile([0.5, 0.6, 0.9], (3, 1)), rtol=0.02)
+    twice = loaded.radiance(point, np.tile([0.0, 0, 1], (3, 1)), 0.1, sky=2.0)
+    np.testing.assert_allclose(twice, 2 * up, rtol=1e-5)
+
+
+def test_what_is_damaged_or_missing_is_found_and_made_again(target):
+    job = job_of(target, hall(0.2))
+    run(job)
+    before, name = bytes_in(target), sorted(sets_in(target))[0]
+    (target / name).write_bytes(before[name][:-1])
+    assert [defect.file for defect in verify(target)] == [name]
+    (target / name).unlink()
+    assert [(defect.file, defect.what) for defect in verify(target)] == [(name, "the file is missing")]
+    folder.list_again(target)
+    assert ["does not say which probes count" in defect.what for defect in verify(target)] == [True]
+    assert run(job).kept
+    assert bytes_in(target) == before
+    assert verify(target) == []
+
+
+def test_entries_of_other_probes_are_refused(target):
+    job = job_of(target, hall(0.2))
+    run(job)
+    name, old = next(iter(sets_in(target).items()))
+    run(dataclasses.replace(job, wish=dataclasses.replace(job.wish, count=2)))
+    (target / name).write_bytes(old)
+    header = folder.load_header(target)
+    cells = [folder.read_cell(target, tuple(entry["cell"])) for entry in header["cells"]]
+    with pytest.raises(container.FileError, match=r"do not belong together|beyond the 2"):
+        probe_cells.load(target, header, cells)
+    assert name in [defect.file for defect in verify(target)]
+
+
+def test_without_probes_nothing_is_left_of_them(tmp_path):
+    target = tmp_path / "bake"
+    bake(hall(0.2), target, SETTINGS, manner=Manner(probes=Wish(2, spending=SPENDING)))
+    assert sets_in(target)
+    bake(hall(0.2), target, SETTINGS)
+    assert not sets_in(target)
+    assert not (target / "probes.exr").exists()
+    assert verify(target) == []
 
 
 @pytest.mark.parametrize("fails", [False, True])

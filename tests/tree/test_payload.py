@@ -149,7 +149,7 @@ def test_the_largest_cell_fits_and_one_more_entry_is_refused():
     valid = np.ones(65_535, bool)
     got = encode(values[:65_535], valid, Goal(1 / 1024))
     assert_bound(values[:65_535], valid, got)
-    exact = payload._distinct(np.arange(65_536, dtype=np.uint32)[:, None])
+    exact = payload.distinct(np.arange(65_536, dtype=np.uint32)[:, None])
     assert len(exact[0]) == 65_536
 
 
