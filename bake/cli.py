@@ -72,6 +72,9 @@ def main(argv: list[str], extract: Extract) -> int:
         The user stopped it.
     """
     options = _parser().parse_args(_joined(argv))
+    misuse = options.misuse(options)
+    if misuse:
+        options.refuse(misuse)
     try:
         return _run(options, extract)
     except BrokenPipeError:
@@ -159,7 +162,7 @@ def _add_command(commands, name: str, text: str, run, show) -> argparse.Argument
     command.add_argument(
         "--json", action="store_true", help="print one JSON object on standard output, and nothing else"
     )
-    command.set_defaults(run=run, show=show)
+    command.set_defaults(run=run, show=show, refuse=command.error, misuse=lambda options: "")
     return command
 
 
@@ -225,6 +228,7 @@ def _add_query(commands) -> None:
     )
     command.add_argument("--directions", type=_path, metavar="D.npy", help=text)
     command.add_argument("--roughness", type=_path, metavar="R.npy", help="(n,) roughness, with --directions")
+    command.set_defaults(misuse=_misuse_of_query)
     command.add_argument("--sun", help="x,y,z towards the sun, instead of the scene's")
 
 
@@ -324,7 +328,6 @@ def _run_verify(options, extract: Extract, progress: Progress) -> dict:
 
 def _run_query(options, extract: Extract, progress: Progress) -> dict:
     check_output(options.output)
-    _check_query(options)
     points = read_array(options.points)
     normals = None if options.normals is None else read_points(options.points, options.normals)[1]
     direction = None
@@ -347,14 +350,15 @@ def _run_query(options, extract: Extract, progress: Progress) -> dict:
     return {"points": len(points), "output": str(options.output)}
 
 
-def _check_query(options) -> None:
-    """Refuse words that do not say what is asked for."""
+def _misuse_of_query(options) -> str:
+    """Say why words do not tell what is asked for; nothing where they do."""
     if (options.directions is None) != (options.roughness is None):
-        raise SettingsError("--directions and --roughness: give both, or neither")
+        return "--directions and --roughness: give both, or neither"
     if options.directions is None and options.normals is None:
-        raise SettingsError("--normals: give them for irradiance, or --directions and --roughness for radiance")
+        return "--normals: give them for irradiance, or --directions and --roughness for radiance"
     if options.directions is not None and options.transport != "all":
-        raise SettingsError(f"--transport {options.transport}: not with --directions, which see all of them")
+        return f"--transport {options.transport}: not with --directions, which see all of them"
+    return ""
 
 
 def _run_reference(options, extract: Extract, progress: Progress) -> dict:

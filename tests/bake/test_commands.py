@@ -463,6 +463,9 @@ def test_the_surface_cache_follows_light_for_longer_unless_told_otherwise(level,
         ["bake", "level.giv", "-o", "out", "--no-fit", "yes"],
         ["bake", "level.giv", "-o", "out", "--method", "photons"],
         ["query", "out", "--points", "p.npy", "-o", "e.npy"],
+        ["query", "out", "--points", "p.npy", "--directions", "d.npy", "-o", "e.npy"],
+        ["query", "out", "--points", "p.npy", "--normals", "n.npy", "--roughness", "r.npy", "-o", "e.npy"],
+        ["query", "out", "--points", "p", "--directions", "d", "--roughness", "r", "-o", "e", "--transport", "sky"],
         ["query", "out", "--points", "p.npy", "--normals", "n.npy", "-o", "e.npy", "--transport", "moon"],
         ["compare", "out", "-o", "seen.png", "--size", "12"],
         ["compare", "out", "-o", "seen.png", "--size", "0x4"],
@@ -543,10 +546,7 @@ def test_query_gives_radiance_along_directions(level, points, tmp_path):
     succeed("query", folder, *words, "--roughness", rough, "-o", found)
     expected = world.load(folder).irradiance(np.load(points.words[1]), np.load(up)) / np.pi
     np.testing.assert_allclose(np.load(found), expected, rtol=1e-5)
-    assert "give both" in call("query", folder, *words, "-o", found).reason
-    assert "--normals: give them" in call("query", folder, *words[:2], "-o", found).reason
     more = (*words, "--roughness", rough, "-o", found)
-    assert "not with --directions" in call("query", folder, *more, "--transport", "sky").reason
     np.save(rough, np.full(count, 1.5))
     assert "row 0 is not between 0 and 1" in call("query", folder, *more).reason
     np.save(rough, np.full((count, 1), 0.5))
