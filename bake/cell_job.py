@@ -417,7 +417,8 @@ def _write(work: Work, cell: tuple[int, int], refined: State, limit: int = 0, ea
     planes = of_cell(data.planes, data.plane, data.position, corner, dim, fill)
     payloads = split(work.scene, light)
     work.arriving[cell] = {name for name, part in payloads.items() if part.any()}
-    return work.place.write_cell(refined.tree, payloads, measured.valid, measured.offset, planes, limit, early)
+    marks = {"early": early, "by_paths": cell in work.checks and work.fails(work.checks[cell])}
+    return work.place.write_cell(refined.tree, payloads, measured.valid, measured.offset, planes, limit, marks)
 
 
 def list_of(cells) -> str:

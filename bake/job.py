@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..tree import build, folder, probe_file
+from ..tree import build, folder
 from ..tree.grid import FIRST_SIZE, Grid
 from ..tree.topology import Topology
 from . import changes, memory, probe_job, snapshot_file, summary
@@ -132,7 +132,7 @@ def bake(
         _forget(target, occupied)
     finally:
         listed = [entry for entry in place.close() if not entry.get("early") or tuple(entry["cell"]) in work.cut]
-    probes, no_probes = _make_probes(work, manner.probes, len(occupied) - len(listed), progress)
+    probes, no_probes = _make_probes(work, manner.probes, listed, len(occupied) - len(listed), progress)
     outcome = summary.describe(snapshot, settings, scene, trees, no_probes)
     outcome.voxels = {"first": grid.first_size, "finest": float(grid.voxel_size(grid.levels - 1))}
     if not settings.finest and grid.first_size != FIRST_SIZE:
@@ -156,6 +156,8 @@ def bake(
     outcome.bytes = summary.file_sizes(listed) | {"probes": probes.bytes}
     if not no_probes:
         outcome.probes = {"count": probes.count, "rays": probes.rays, "noise": probes.noise}
+        if probes.count < manner.probes.count and not manner.probes.least_gain:
+            outcome.warnings.append(f"{manner.probes.count} reflection probes were asked for: {probes.why}")
     return outcome
 
 
@@ -302,26 +304,24 @@ def _bake_cells(work: Work, cells: list[tuple[int, int]], progress: Progress) ->
     return run_jobs(bake_one, len(cells), work.target.effort.threads)
 
 
-def _make_probes(work: Work, wish: Wish | None, missing: int, progress: Progress) -> tuple[Made, str]:
-    """Reflection probes, or why there are none; older ones go then."""
+def _make_probes(work: Work, wish: Wish | None, listed: list[dict], missing: int, progress: Progress):
+    """Reflection probes (Made), and why there are none; older ones go where there are to be none."""
     settings, target = work.settings, work.place.target
     effort = Effort(0, settings.bounces, settings.seed, work.target.effort.threads)
-    trusted = settings.method == "cache" and not any(work.fails(check) for check in work.checks.values())
+    trusted = settings.method == "cache" and not any(entry.get("by_paths") for entry in listed)
     job = probe_job.Job(work.scene, work.grid, target, work.judge.mean, wish or Wish(), effort, trusted)
-    if wish is None:
-        why = "none were asked for"
-    elif missing:
+    why = probe_job.why_none(job) if wish else "none were asked for"
+    if missing and wish:
         why = f"{missing} of the scene's cells are not baked yet, and probes look at all of them"
-    else:
-        why = "the time was too short" if not work.deadline.left else probe_job.why_none(job)
-    if not why:
-        progress.stage("Probes", STEPS)
-        return probe_job.run(job, lambda share: progress.show(int(share * STEPS))), ""
-    if missing == 0 and probe_file.describe(target) is not None:
-        for path in (target / probe_file.PROBES, *target.glob("cell_*.probes")):
-            path.unlink()
-        folder.list_again(target)
-    return Made(0, 0), why
+    elif why and not missing:
+        probe_job.remove(target)
+    elif not (why or work.deadline.left or probe_job.is_made(job)):
+        why = "the time was too short"
+    if why:
+        return Made(0, 0), why
+    progress.stage("Probes", STEPS)
+    made = probe_job.run(job, lambda share: progress.show(int(share * STEPS)))
+    return made, "" if made.count else made.why
 
 
 def _forget(target: Path, occupied: list[tuple[int, int]]) -> None:

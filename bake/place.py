@@ -44,7 +44,7 @@ def check_target(target: Path) -> None:
     Raises
     ------
     SettingsError
-        It is a file, cannot be made, or another program's `world.json` is in it.
+        It is a file, cannot be made, or another program's `world.json` or `probes.exr` is in it.
     """
     if target.exists() and not target.is_dir():
         raise SettingsError(f"{target}: this is a file; a bake needs a folder")
@@ -52,6 +52,9 @@ def check_target(target: Path) -> None:
     if not target.exists() and not (parent.is_dir() and os.access(parent, os.W_OK | os.X_OK)):
         why = "cannot be written to" if parent.is_dir() else "is a file"
         raise SettingsError(f"{target}: {parent} {why}; choose another folder for the bake")
+    probes = target / probe_file.PROBES
+    if probes.exists() and not probe_file.is_ours(probes):
+        raise SettingsError(f"{probes}: another program's file, or a damaged one; move it away, or bake elsewhere")
     if (target / folder.WORLD).is_dir():
         raise SettingsError(f"{target / folder.WORLD}: this is a folder; choose another folder for the bake")
     try:
@@ -187,7 +190,7 @@ class Place:
         offset: np.ndarray,
         planes: CellPlanes | None = None,
         limit: int = 0,
-        early: bool = False,
+        marks: dict[str, bool] | None = None,
     ) -> int:
         """Put all files of a cell into the folder, or none; the tree, which makes a cell count, comes last. Several
         threads may write cells at once.
@@ -206,8 +209,9 @@ class Place:
             Occluding planes of the data points; none when left out.
         limit : int
             Files that take more bytes than this together are not put there; 0 for no limit.
-        early : bool
-            Whether the cell is a coarse one that will be replaced.
+        marks : dict of str to bool, optional
+            What holds of the cell: "early" of a coarse one that will be replaced, "by_paths" where its surface cache
+            was too far off.
 
         Returns
         -------
@@ -222,7 +226,7 @@ class Place:
             The folder is closed.
         """
         with self._stage() as staging:
-            meta = {"bake": self.identity} | ({"early": True} if early else {})
+            meta = {"bake": self.identity} | {name: True for name, holds in (marks or {}).items() if holds}
             folder.write_cell(staging, tree, payloads, valid, offset, meta, planes)
             size = sum(path.stat().st_size for path in staging.iterdir())
             if limit and size > limit:

@@ -11,7 +11,7 @@ import functools
 import hashlib
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +21,7 @@ from ..tree.cells import TREE, cell_path, read_cell, read_tree
 from ..tree.grid import Grid
 from ..tree.interpolate import join
 from ..tree.probe_atlas import Layout
+from ..tree.probe_sets import KIND
 from ..tree.topology import Topology
 from . import radiosity
 from .capture import FIRST_RAYS, HALVES, Spending, Studio, shoot
@@ -33,7 +34,7 @@ from .probes import LEAST_GAIN, Request, place
 from .scene import Scene
 from .settings import ERRORS, Settings
 
-__all__ = ["AUTOMATIC", "Job", "Made", "Wish", "probe_bytes", "run", "spending_of", "why_none"]
+__all__ = ["AUTOMATIC", "Job", "Made", "Wish", "is_made", "probe_bytes", "remove", "run", "spending_of", "why_none"]
 
 FORMAT = "gi_volumes probes 1"
 """Part of every file's hash: probes of another definition are captured anew."""
@@ -115,8 +116,8 @@ class Made:
     """What became of it.
 
     count : probes
-    bytes : length of the file
-    why : why there are no more, in words; of a file that was kept nothing
+    bytes : length of the file, and of those that say which probes count where
+    why : why there are no more, in words
     kept : whether the file was there
     rays, noise : mean number of rays of a texel, and root mean square of what they left, as `capture.Spending` has it
     """
@@ -191,24 +192,68 @@ def run(job: Job, show: Callable[[float], bool] = lambda share: True) -> Made:
     header = folder.load_header(job.target)
     trees = tuple(_trees(job.target, header))
     made = _digest(job, trees)
-    if probe_file.made_of(job.target, header["bake"]) == made:
-        found = Made(0, 0, kept=True)
-    else:
-        found = _capture(job, trees, header["bake"], made, _part_of(show, 0, 1 - SEEN))
+    kept = probe_file.made_of(job.target, header["bake"]) == made
+    if not kept:
+        _capture(job, trees, header["bake"], made, _part_of(show, 0, 1 - SEEN))
+        folder.list_again(job.target)
     _see_all(job, header, made, _part_of(show, 1 - SEEN, SEEN))
-    listed = folder.list_again(job.target)["probes"]
-    return replace(found, count=len(listed["positions"]), bytes=listed["file"]["bytes"])
+    listed = folder.list_again(job.target)
+    said, file = listed["probes"]["said"], listed["probes"]["file"]
+    size = file["bytes"] + sum(entry["files"].get("probes", {"bytes": 0})["bytes"] for entry in listed["cells"])
+    return Made(len(listed["probes"]["positions"]), size, said["why"], kept, said["rays"], said["noise"])
 
 
-def _capture(job: Job, trees: tuple[Topology, ...], bake: str, made: str, show: Callable[[float], bool]) -> Made:
+def is_made(job: Job) -> bool:
+    """Say whether a bake has its probes.
+
+    Parameters
+    ----------
+    job : Job
+        What they would be made of.
+
+    Returns
+    -------
+    bool
+        Whether there is a whole file of just these; which of them count where may be missing.
+
+    Raises
+    ------
+    FileError, OSError
+        A cell cannot be read.
+    """
+    header = folder.load_header(job.target)
+    return probe_file.made_of(job.target, header["bake"]) == _digest(job, tuple(_trees(job.target, header)))
+
+
+def remove(target: Path) -> None:
+    """Remove the probes of a bake.
+
+    Parameters
+    ----------
+    target : Path
+        Its folder; other programs' files stay.
+
+    Raises
+    ------
+    OSError
+        A file cannot be removed.
+    """
+    paths = [path for path in folder.files(target) if path.name == probe_file.PROBES or path.suffix == f".{KIND}"]
+    for path in sorted(paths, key=lambda path: path.suffix == f".{KIND}"):
+        path.unlink(missing_ok=True)
+    if paths:
+        folder.list_again(target)
+
+
+def _capture(job: Job, trees: tuple[Topology, ...], bake: str, made: str, show: Callable[[float], bool]) -> None:
     """Place probes, and write what they see."""
     placed = place(job.scene, Forest(job.grid, trees), _request(job), job.effort, _part_of(show, 0, PLACED))
     maps = probe_maps.empty(placed.position + job.scene.origin, placed.pinned, job.wish.spending.pitch, job.parts)
     studio = Studio.of(maps, job.mixture, job.wish.spending, job.effort)
     _shoot_all(job, studio, trees, _part_of(show, PLACED, 1 - PLACED))
-    probe_file.write(job.target, maps, bake, made)
     rays, noise = (part if len(part) else np.zeros(1) for part in (studio.rays, studio.noise))
-    return Made(0, 0, placed.reason, False, float(rays.mean()), float(np.sqrt((noise**2).mean())))
+    said = {"why": placed.reason, "rays": float(rays.mean()), "noise": float(np.sqrt((noise**2).mean()))}
+    probe_file.write(job.target, maps, bake, made, said)
 
 
 def _see_all(job: Job, header: dict, made: str, show: Callable[[float], bool]) -> None:
@@ -262,7 +307,7 @@ def _digest(job: Job, trees: tuple[Topology, ...]) -> str:
     asked = [wish.count, wish.megabytes, wish.least_gain, wish.spending.error, wish.spending.most, wish.spending.pitch]
     asked += [wish.only_if_glossy]
     asked += [np.asarray(wish.pinned, np.float64).tolist(), np.asarray(wish.deleted, np.float64).tolist()]
-    done = [effort.bounces, effort.seed, [tree.cell for tree in trees]]
+    done = [effort.bounces, effort.seed, job.cached, [tree.cell for tree in trees]]
     return hashlib.blake2b(json.dumps([FORMAT, asked, done]).encode(), digest_size=16).hexdigest()
 
 

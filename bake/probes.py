@@ -153,7 +153,7 @@ def place(
     seeing = views(scene, position, seen, effort.threads)
     _show(progress, 0.9)
     chosen = choose(seeing, seen.weight, limit, request.least_gain, len(pinned))
-    reason = _reason(len(seen.weight), found, limit, chosen)
+    reason = _reason(len(seen.weight), found, request, chosen)
     of_pinned = chosen.place < len(pinned)
     total = float(seen.weight.sum(dtype=np.float64))
     _show(progress, 1.0)
@@ -166,10 +166,12 @@ def _show(progress: Callable[[float], bool] | None, share: float) -> None:
         raise CancelledError
 
 
-def _reason(patch_count: int, found: Candidates, limit: int, chosen: Choice) -> str:
+def _reason(patch_count: int, found: Candidates, request: Request, chosen: Choice) -> str:
     """Why the choice ended."""
+    limit = request.limit()
     if len(chosen.place) >= limit:
-        return f"{limit} probes are as many as were asked for"
+        of = "were asked for" if limit == request.count else f"{request.megabytes:g} MB have room for"
+        return f"{limit} probes are as many as {of}"
     inside = f"{found.inside} of {found.looked_at} candidates see the backs of surfaces, as those inside walls do"
     if not len(found.position):
         return f"no candidate is free: {inside}" if found.looked_at else "no candidate is left: all space is deleted"

@@ -350,7 +350,7 @@ class Refinement:
     def _hide_finally(self) -> None:
         """The same for what has changed since."""
         if self.hidden is None:
-            return self._hide_midway()
+            self._hide_midway()
         parallel.check()
         none = np.zeros(self.state.tree.size, bool)
         found = hidden.since(self.scene, self.state, self.hidden, none, self.target.effort.threads)

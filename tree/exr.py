@@ -45,7 +45,7 @@ LONGEST_NAME = 31
 
 CHUNK = struct.Struct("<iii")
 OFFSET = struct.Struct("<Q")
-REMEDY = "it is damaged, or another program has written it: capture the probes again"
+REMEDY = "it is damaged, or another program has written it: bake again"
 
 
 @dataclass(frozen=True)

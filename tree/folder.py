@@ -33,7 +33,7 @@ from .cells import (
 )
 from .container import FileError
 from .grid import Grid
-from .probe_file import PROBES, describe
+from .probe_file import PROBES, describe, is_ours
 from .topology import Topology
 
 __all__ = [
@@ -208,7 +208,8 @@ def files(folder: str | os.PathLike) -> list[Path]:
     folder = Path(folder)
     if not folder.is_dir():
         return []
-    return sorted(path for path in folder.iterdir() if path.is_file() and _is_ours(path.name))
+    found = (path for path in folder.iterdir() if path.is_file() and _is_ours(path.name))
+    return sorted(path for path in found if path.name != PROBES or is_ours(path))
 
 
 def _is_ours(name: str) -> bool:
@@ -235,7 +236,7 @@ def _describe_cell(folder: str | os.PathLike, topology: Topology, meta: dict, gr
     keys = ("data_points", "valid_points", "left_out")
     entry = {"cell": list(topology.cell), "bounds": [low.tolist(), high.tolist()], "files": listed}
     entry |= {key: meta[key] for key in keys} | {"dilated": meta.get("dilated", 0)}
-    return entry | ({"early": True} if meta.get("early") else {})
+    return entry | {mark: True for mark in ("early", "by_paths") if meta.get(mark)}
 
 
 def _bounds(boxes: list) -> list | None:

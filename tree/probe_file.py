@@ -22,16 +22,19 @@ from .container import FileError
 from .probe_atlas import SMALLEST_PITCH, Layout
 from .probe_maps import ProbeMaps, empty
 
-__all__ = ["PROBES", "describe", "load", "made_of", "read", "write"]
+__all__ = ["PROBES", "describe", "is_ours", "load", "made_of", "read", "write"]
 
 PROBES = "probes.exr"
 SURFACES = ("distance", "normal", "albedo")
 PART_NAME = re.compile(r"local|sun\.\d+|sky(\.\d+)?")
-AGAIN = "capture the probes again"
+AGAIN = "bake again"
 """What to do about a file that cannot be used."""
 
+NOTED = 1 << 24
+"""Bytes of a file that its note is looked for in: those before its pixels, of a hundred thousand probes."""
 
-def write(folder: str | os.PathLike, maps: ProbeMaps, bake: str, made: str) -> None:
+
+def write(folder: str | os.PathLike, maps: ProbeMaps, bake: str, made: str, said: dict | None = None) -> None:
     """Write the file, atomically.
 
     Parameters
@@ -44,6 +47,8 @@ def write(folder: str | os.PathLike, maps: ProbeMaps, bake: str, made: str) -> N
         Hash of the bake.
     made : str
         Hash of what the probes depend on besides.
+    said : dict, optional
+        What else the note is to hold, as "said"; anything that JSON has.
 
     Raises
     ------
@@ -60,6 +65,7 @@ def write(folder: str | os.PathLike, maps: ProbeMaps, bake: str, made: str) -> N
         "parts": list(maps.radiance),
         "positions": np.asarray(maps.position, np.float64).tolist(),
         "pinned": [bool(value) for value in maps.pinned],
+        "said": said or {},
     }
     images = {f"{name}.level_{k}": level for name, levels in maps.radiance.items() for k, level in enumerate(levels)}
     images |= {name: getattr(maps, name) for name in SURFACES}
@@ -97,6 +103,26 @@ def read(path: str | os.PathLike) -> tuple[ProbeMaps, dict]:
         raise FileError(path, 0, f"{reason}; {AGAIN}") from None
 
 
+def is_ours(path: str | os.PathLike) -> bool:
+    """Say whether a file is one of a bake's probes, by its beginning.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+
+    Returns
+    -------
+    bool
+        False for those of other programs, and where the beginning is damaged.
+    """
+    try:
+        with Path(path).open("rb") as file:
+            return _is_note(json.loads(exr.note_of(file.read(NOTED), path)))
+    except (OSError, ValueError, TypeError, RecursionError):
+        return False
+
+
 def describe(folder: str | os.PathLike) -> dict | None:
     """Say what `world.json` has to say of the probes in a folder.
 
@@ -108,12 +134,13 @@ def describe(folder: str | os.PathLike) -> dict | None:
     Returns
     -------
     dict or None
-        The note, and name, length and SHA-256 of the file; None where no file has a note.
+        The note, and name, length and SHA-256 of the file; None where no file has a note of a bake's probes.
     """
     path = Path(folder) / PROBES
     try:
         data = path.read_bytes()
-        return _entry(path, data, json.loads(exr.note_of(data, path)))
+        note = json.loads(exr.note_of(data, path), parse_constant=_refuse)
+        return _entry(path, data, note) if _is_note(note) else None
     except (OSError, ValueError, TypeError, RecursionError):
         return None
 
@@ -181,15 +208,27 @@ def _entry(path: Path, data: bytes, note: dict) -> dict:
     return dict(note) | {"file": file}
 
 
+def _is_note(note: object) -> bool:
+    """Whether a note says which bake it belongs to."""
+    return isinstance(note, dict) and all(isinstance(note.get(key), str) for key in ("bake", "made"))
+
+
+def _refuse(constant: str) -> float:
+    """`world.json` has no numbers that are none."""
+    raise ValueError(f"{constant} is no number")
+
+
 def _maps_of(images: dict[str, np.ndarray], note: dict) -> ProbeMaps:
     """Maps of a file's images, if note and images fit; the note alone makes nothing large."""
-    position, pinned = np.array(note["positions"], np.float64).reshape(-1, 3), np.array(note["pinned"])
+    position, pinned = np.array(note["positions"] or np.zeros((0, 3)), np.float64), np.array(note["pinned"])
+    if position.ndim != 2 or position.shape[1] != 3:
+        raise ValueError("its note has places that are not three numbers each")
     layout = Layout.of(len(position), note["pitch"])
     if (note["columns"], note["rows"]) != (layout.columns, layout.rows) or not np.isfinite(position).all():
         raise ValueError("its note names other tiles than its probes have, or places that are no numbers")
     if len(pinned) != len(position) or (len(pinned) and pinned.dtype != bool) or not _are_parts(note["parts"]):
         raise ValueError("its note names unknown parts, or is not clear about pinned probes")
-    if not (isinstance(note["bake"], str) and isinstance(note["made"], str)):
+    if not (_is_note(note) and isinstance(note["said"], dict)):
         raise ValueError("its note does not say which bake it belongs to")
     radiance = {
         name: tuple(_image(images, f"{name}.level_{level}", layout, level) for level in range(layout.levels))

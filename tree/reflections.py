@@ -116,9 +116,11 @@ class Reflections:
             Radiance by mip level [W/(m2 sr)], finite and not negative; each transport is clamped by itself.
         """
         key = tuple((name, factor.tobytes()) for name, factor in factors.items())
-        if self._remembered[0] != key:
-            self._remembered = key, tuple(self._mixed(level, factors) for level in range(self._layout.levels))
-        return self._remembered[1]
+        remembered = self._remembered
+        if remembered[0] != key:
+            remembered = key, tuple(self._mixed(level, factors) for level in range(self._layout.levels))
+            self._remembered = remembered
+        return remembered[1]
 
     def _mixed(self, level: int, factors: dict[str, np.ndarray]) -> np.ndarray:
         """One mip level."""
@@ -198,7 +200,8 @@ def _joined(sets: Sequence[ProbeSets]) -> tuple[np.ndarray, np.ndarray, np.ndarr
     """(rows,) entry of each voxel, (entries, slots) probes and weights; the last entry has none."""
     slots = max((part.probe.shape[1] for part in sets), default=1)
     first = np.cumsum([0, *(len(part.probe) for part in sets)])
-    index = [np.where(p.index == NO_DATA, first[-1], p.index + start) for p, start in zip(sets, first, strict=False)]
+    rows = [part.index.astype(np.int64) for part in sets]
+    index = [np.where(row == NO_DATA, first[-1], row + start) for row, start in zip(rows, first, strict=False)]
     tables = []
     for name in ("probe", "weight"):
         parts = [getattr(part, name).astype(np.int64) for part in sets] + [np.zeros((1, slots), np.int64)]

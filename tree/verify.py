@@ -64,25 +64,33 @@ def verify(path: str | os.PathLike) -> list[Defect]:
 def _defects(path: Path, header: dict) -> Iterator[Defect]:
     """Cell by cell, then what should be there and is not, then the probes."""
     listed = {tuple(entry["cell"]) for entry in header["cells"]}
+    of_probes = _probes_defect(path, header)
     for entry in header["cells"]:
-        yield from _cell_defects(path, entry, header)
+        yield from _cell_defects(path, entry, header, of_probes is None)
         if entry.get("early"):
             what = f"cell {entry['cell'][0]},{entry['cell'][1]} is an early look: not baked to its end yet"
             yield Defect(cell_path(path, entry["cell"], "tree").name, what)
     for cell in header.get("expected_cells", []):
         if tuple(cell) not in listed:
             yield Defect(cell_path(path, cell, "tree").name, f"cell {cell[0]},{cell[1]} is missing: not baked yet")
-    try:
-        probe_file.load(path, header)
-    except (OSError, FileError) as error:
-        yield Defect(probe_file.PROBES, _reason(error))
+    if of_probes is not None:
+        yield of_probes
     for entry in header["cells"] if "probes" in header else ():
         if "probes" not in entry["files"]:
             what = f"cell {entry['cell'][0]},{entry['cell'][1]} does not say which probes count where"
             yield Defect(probe_cells.path_of(path, entry["cell"]).name, what)
 
 
-def _cell_defects(path: Path, entry: dict, header: dict) -> Iterator[Defect]:
+def _probes_defect(path: Path, header: dict) -> Defect | None:
+    """What is wrong with the probes' file."""
+    try:
+        probe_file.load(path, header)
+    except (OSError, FileError) as error:
+        return Defect(probe_file.PROBES, _reason(error))
+    return None
+
+
+def _cell_defects(path: Path, entry: dict, header: dict, has_probes: bool) -> Iterator[Defect]:
     """Files against their hashes; when these fit, the cell against its invariants."""
     broken = False
     for file in entry["files"].values():
@@ -99,7 +107,8 @@ def _cell_defects(path: Path, entry: dict, header: dict) -> Iterator[Defect]:
         yield Defect(Path(getattr(error, "path", tree)).name, _reason(error))
         return
     try:
-        probe_cells.load(path, header | {"cells": [entry]}, [cell])
+        if has_probes:
+            probe_cells.load(path, header | {"cells": [entry]}, [cell])
     except (OSError, FileError) as error:
         yield Defect(Path(getattr(error, "path", tree)).name, _reason(error))
     if cell.meta["bake"] != header["bake"]:

@@ -12,7 +12,7 @@ import build_scenes
 import numpy as np
 import pytest
 from command_line import QUICK, call, stored, succeed
-from gi_volumes.bake import cell_job, cli, probe_job, radiosity
+from gi_volumes.bake import cell_job, check, cli, probe_job, radiosity
 from gi_volumes.bake.capture import Spending
 from gi_volumes.bake.changes import causes
 from gi_volumes.bake.gather import Effort
@@ -80,7 +80,7 @@ def test_probes_are_placed_captured_listed_and_found_sound(target):
     assert (made.count, made.kept, list(maps.radiance)) == (3, False, ["local", "sky"])
     inside = (maps.position > at(0.2, 0.5, 0.1)) & (maps.position < at(10.2, 8.5, 8))
     assert inside.all()
-    assert made.bytes == (target / "probes.exr").stat().st_size
+    assert made.bytes == sum(path.stat().st_size for path in (target / "probes.exr", *target.glob("*.probes")))
     assert made.noise <= 0.5
     assert made.rays == 16
     assert maps.radiance["local"][0].astype(float).mean() > 0.05
@@ -92,7 +92,7 @@ def test_valid_probes_are_kept_and_others_made_anew(target):
     first = run(job)
     before = bytes_in(target)
     stamp = (target / "probes.exr").stat().st_mtime_ns
-    assert run(job) == Made(3, first.bytes, kept=True)
+    assert run(job) == dataclasses.replace(first, kept=True)
     assert bytes_in(target) == before
     assert (target / "probes.exr").stat().st_mtime_ns == stamp
     for changes in (
@@ -131,6 +131,29 @@ def test_work_that_is_stopped_leaves_the_folder_as_it_was(target, share):
     with pytest.raises(CancelledError):
         run(job_of(target, hall(0.2)), lambda done: done < share)
     assert bytes_in(target) == before
+
+
+def test_other_probes_that_are_stopped_leave_a_bake_that_can_be_loaded(target):
+    job = job_of(target, hall(0.2))
+    run(job)
+    for share in (0.05, 0.5, 0.97):
+        with pytest.raises(CancelledError):
+            run(dataclasses.replace(job, wish=Wish(2, spending=SPENDING)), lambda done, share=share: done < share)
+        assert len(world.load(target).irradiance(at(1, 2, 3)[None], [[0, 0, 1]])) == 1
+    assert run(dataclasses.replace(job, wish=Wish(2, spending=SPENDING))).count == 2
+    assert verify(target) == []
+
+
+def test_probes_go_and_other_programs_files_stay(target):
+    run(job_of(target, hall(0.2)))
+    (target / "cell_phone.probes").write_bytes(b"mine")
+    probe_job.remove(target)
+    assert (target / "cell_phone.probes").read_bytes() == b"mine"
+    assert not any(
+        path.name == "probes.exr" or (path.name.startswith("cell_0") and path.suffix == ".probes")
+        for path in target.iterdir()
+    )
+    assert verify(target) == []
 
 
 def test_progress_rises_from_begin_to_end(target, monkeypatch):
@@ -249,11 +272,14 @@ def test_the_command_makes_probes_where_surfaces_are_glossy(tmp_path, monkeypatc
     monkeypatch.setattr(cli.probe_job, "AUTOMATIC", probe_bytes(128, 1) * 1.5e-6)
     said = made_by_command(mirrored(), tmp_path)
     assert said["probes"]["count"] == 1
-    assert said["bytes"]["probes"] == (tmp_path / "bake/probes.exr").stat().st_size
+    files = [tmp_path / "bake/probes.exr", *(tmp_path / "bake").glob("*.probes")]
+    assert said["bytes"]["probes"] == sum(path.stat().st_size for path in files)
     assert "probes" in said["modelled"]
     assert succeed("verify", tmp_path / "bake") == {"defects": []}
     again = made_by_command(mirrored(), tmp_path)
-    assert again["probes"] == {"count": 1, "rays": 0.0, "noise": 0.0}
+    assert again["probes"] == said["probes"]
+    late = succeed("bake", tmp_path / "level.giv", "-o", tmp_path / "bake", *QUICK, "--minutes", "1e-9")
+    assert late["probes"] == said["probes"]
     none = made_by_command(mirrored(), tmp_path, "--probes", "none")
     assert "probes" not in none["modelled"]
     assert {"what": "probes", "why": "none were asked for"} in none["left_out"]
@@ -267,6 +293,41 @@ def test_the_command_says_why_a_dull_scene_has_none_and_makes_them_if_asked(tmp_
     assert why.startswith("0.0 % of all surfaces are smoother than roughness 0.4; --probes N")
     said = call("bake", tmp_path / "level.giv", "-o", tmp_path / "bake", *QUICK, "--probes", "1").out
     assert re.search(r"^1 reflection probes, 0\.\d\d MB, \d+ rays a texel, noise \d+\.\d %$", said, re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"), [(["0"], "0 probes are as many as were asked for"), (["5"], "no candidate")]
+)
+def test_the_command_says_why_there_are_none_or_fewer(tmp_path, words, reason):
+    everywhere = (at(-99, -99, -99), at(99, 99, 99))
+    said = made_by_command(said_by(hall(0.2), deleted=everywhere), tmp_path, "--probes", *words)
+    (why,) = [item["why"] for item in said["left_out"] if item["what"] == "probes"]
+    assert reason in why
+    assert "probes" not in said["modelled"]
+    few = made_by_command(hall(0.2), tmp_path, "--probes", "5", "--probe-megabytes", "1")
+    assert few["probes"]["count"] == 2
+    assert "5 reflection probes were asked for: 2 probes are as many as 1 MB have room for" in few["warnings"]
+
+
+def test_no_other_program_s_file_is_replaced(tmp_path):
+    (tmp_path / "bake").mkdir()
+    (tmp_path / "bake/probes.exr").write_bytes(b"mine")
+    said = call("bake", stored(tmp_path, hall(0.2)), "-o", tmp_path / "bake", *QUICK)
+    assert said.reason.endswith("another program's file, or a damaged one; move it away, or bake elsewhere")
+    assert (tmp_path / "bake/probes.exr").read_bytes() == b"mine"
+
+
+def test_a_bake_in_parts_makes_the_probes_of_a_bake_in_one_go(tmp_path, monkeypatch):
+    monkeypatch.setattr(check.Check, "fails", lambda self, error: True)
+    monkeypatch.setattr(cell_job, "WORTH", 0)
+    whole = made_by_command(mirrored(), tmp_path, "--probes", "1", "--method", "cache")
+    assert any("too far off" in text for text in whole["warnings"])
+    first = bytes_in(tmp_path / "bake")
+    monkeypatch.undo()
+    for path in (tmp_path / "bake").glob("*probes*"):
+        path.unlink()
+    made_by_command(mirrored(), tmp_path, "--probes", "1", "--method", "cache")
+    assert bytes_in(tmp_path / "bake") == first
 
 
 def said_by(snapshot: Snapshot, *pinned: np.ndarray, deleted: tuple = ()) -> Snapshot:

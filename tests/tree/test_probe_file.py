@@ -83,7 +83,7 @@ def test_probes_of_another_bake_are_not_listed(tmp_path):
 def test_a_missing_file_is_said(bake):
     place, header = bake
     (place / "probes.exr").unlink()
-    with pytest.raises(FileNotFoundError, match="capture the probes again"):
+    with pytest.raises(FileNotFoundError, match="bake again"):
         probe_file.load(place, header)
     assert [defect.file for defect in verify(place)] == ["probes.exr"]
 
@@ -94,7 +94,7 @@ def test_truncated_files_are_refused_at_any_length(bake):
     whole = path.read_bytes()
     for length in np.linspace(0, len(whole) - 1, 200).astype(int):
         path.write_bytes(whole[:length])
-        with pytest.raises(FileError, match=r"probes\.exr: byte \d+: .*capture the probes again"):
+        with pytest.raises(FileError, match=r"probes\.exr: byte \d+: .*bake again"):
             probe_file.load(place, header)
         assert probe_file.made_of(place, BAKE) is None
 
@@ -106,7 +106,7 @@ def test_a_flipped_byte_is_always_found(bake):
     for position in np.random.default_rng(0).permutation(len(whole))[:300]:
         whole[position] ^= 0x10
         path.write_bytes(whole)
-        with pytest.raises(FileError, match="capture the probes again"):
+        with pytest.raises(FileError, match="bake again"):
             probe_file.load(place, header)
         whole[position] ^= 0x10
 
@@ -130,7 +130,9 @@ def forged(place, note: dict | None = None, **changes) -> None:
     [
         ({"positions": [[0, 0, 0]]}, "other tiles"),
         ({"positions": [[0, 0, 0]] * 2 + [[0, 0, float("nan")]]}, "no numbers"),
-        ({"positions": [[0, 0]] * 3}, "other tiles"),
+        ({"positions": [[0, 0]] * 3}, "three numbers"),
+        ({"positions": [0] * 9}, "three numbers"),
+        ({"said": None}, "which bake"),
         ({"positions": "everywhere"}, "could not convert|its note"),
         ({"positions": {}}, "its note"),
         ({"pitch": 17}, "power of two"),
@@ -177,12 +179,23 @@ def test_forged_images_are_refused(bake, changes, reason):
         probe_file.read(place / "probes.exr")
 
 
+@pytest.mark.parametrize(
+    "note", ['{"bake": "0123456789abcdef"}', '{"bake": "0123456789abcdef", "made": "", "x": NaN}', "[]"]
+)
+def test_a_file_of_no_bake_is_not_listed(bake, note):
+    place, header = bake
+    images, _ = exr.decode((place / "probes.exr").read_bytes(), "")
+    (place / "probes.exr").write_bytes(exr.encode(images, note))
+    assert probe_file.describe(place) is None
+    assert "probes" not in folder.list_again(place)
+
+
 def test_a_note_that_is_no_object_is_refused(bake):
     place, _ = bake
     images, _ = exr.decode((place / "probes.exr").read_bytes(), "")
     for text in ("", "[]", "7", "[" * 100_000, '"a"', "{}"):
         (place / "probes.exr").write_bytes(exr.encode(images, text))
-        with pytest.raises(FileError, match="capture the probes again"):
+        with pytest.raises(FileError, match="bake again"):
             probe_file.read(place / "probes.exr")
         assert "probes" not in folder.assemble(place, {"bake": BAKE, "grid": Grid(), "transports": {}})
 

@@ -18,7 +18,8 @@ from gi_volumes.tree.build import build
 from gi_volumes.tree.grid import Grid
 from gi_volumes.tree.interpolate import join
 from gi_volumes.tree.probe_maps import ProbeMaps
-from gi_volumes.tree.probe_sets import ProbeSets
+from gi_volumes.tree.probe_sets import WHOLE, ProbeSets
+from gi_volumes.tree.reflections import _joined
 from gi_volumes.tree.world import World
 
 GRAY = Material("gray", Channel((0.5,) * 3))
@@ -98,6 +99,14 @@ def test_a_mirror_in_a_coloured_room_shows_the_right_wall_for_every_direction(ro
     assert off[clear].mean() < 0.005
     assert np.quantile(off[clear], 0.99) < 0.1
     assert ((found > 0.5) == (walls(hit) > 0.5))[clear].all(axis=1).mean() > 0.998
+
+
+def test_entries_of_many_cells_are_told_apart():
+    """Their numbers together do not fit 16 bits."""
+    index, weight = np.arange(40_000, dtype=np.uint16), np.full((40_000, 1), WHOLE, np.uint8)
+    cells = [ProbeSets(index, np.full((40_000, 1), probe, np.uint16), weight) for probe in (1, 2)]
+    row, probe, _ = _joined(cells)
+    assert (probe[row, 0] == np.repeat([1, 2], 40_000)).all()
 
 
 def test_without_parallax_the_wrong_wall_would_be_shown(room, monkeypatch):
