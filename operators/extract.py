@@ -120,7 +120,7 @@ def _gather(depsgraph: bpy.types.Depsgraph, meshes: Meshes, lamps: Lamps, probes
         if not instance.show_self:
             continue
         if is_probe(object):
-            probes.add(object, placements.matrix(instance), name)
+            probes.add(object, placements.matrix(instance)[:3, 3], name)
         elif isinstance(object.data, bpy.types.Mesh):
             if _lights_others(object, notes):
                 meshes.add(object, placements.matrix(instance), name)

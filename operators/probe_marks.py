@@ -1,8 +1,8 @@
 """What an artist says about reflection probes by the objects that stand for them.
 
 Comes in: a scene's objects. Goes out: which places are pinned, and boxes around those that are deleted. A probe is
-pinned where its object says so or is not where the bake had put it; it is deleted where the bake had put one and no
-object stands for it any more. Hidden ones count like others.
+pinned where its object says so or is not where the bake had put it, or was made by somebody else; it is deleted where
+the bake had put one and no object stands for it any more. Hidden ones count like others.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from .probe_properties import PROBE
 # Part of a probe's reach that it may be off before it counts as moved: rounding, when it gets a parent, is less.
 STILL = 1 / 1000
 MAX_PARENTS = 64
+# Half the distance to the nearest other probe [m] where no bake has said it.
+USUAL_REACH = 1.0
 
 
 class Marks:
@@ -27,15 +29,15 @@ class Marks:
         self._pinned: list[np.ndarray] = []
         self._met: set[int] = set()
 
-    def add(self, object: bpy.types.Object, matrix: np.ndarray, name: str) -> None:
+    def add(self, object: bpy.types.Object, place: np.ndarray, name: str) -> None:
         """Add a probe, or an instance of one.
 
         Parameters
         ----------
         object : bpy.types.Object
             Stands for a probe.
-        matrix : (4, 4) float64 [m]
-            World from object.
+        place : (3,) float64 [m]
+            World space.
         name : str
             Its name, for messages.
 
@@ -45,7 +47,6 @@ class Marks:
             The place is not finite.
         """
         self._met.add(object.original.as_pointer())
-        place = matrix[:3, 3]
         if not np.isfinite(place).all():
             raise SnapshotError(f"reflection probe '{name}' has an invalid transform: reset its location")
         if is_pinned(object, place):
@@ -67,7 +68,7 @@ class Marks:
         found = probes_of(scene)
         for object in found:
             if object.as_pointer() not in self._met:
-                self.add(object, _resting(object), object.name)
+                self.add(object, place_of(object), object.name)
         pinned = np.unique(np.array(self._pinned, np.float64).reshape(-1, 3), axis=0)
         return ProbeEdits(pinned, boxes(deleted(scene, found)))
 
@@ -118,10 +119,13 @@ def is_pinned(object: bpy.types.Object, place: np.ndarray) -> bool:
     Returns
     -------
     bool
-        Whether it was pinned, or is not where the bake had put it.
+        Whether it was pinned, is not where the bake had put it, or nobody knows: the bake never had it, or Blender has
+        not evaluated its constraints.
     """
     settings = object.original.gi_volumes
-    return settings.kept or math.dist(place, settings.placed) > STILL * settings.reach
+    if settings.kept or not settings.reach or _is_lost(object.original):
+        return True
+    return math.dist(place, settings.placed) > STILL * settings.reach
 
 
 def place_of(object: bpy.types.Object) -> np.ndarray:
@@ -137,11 +141,8 @@ def place_of(object: bpy.types.Object) -> np.ndarray:
     (3,) float64 ndarray [m]
         World space; as Blender has evaluated it where constraints have a say.
     """
-    at, parents = object, 0
-    while at is not None and parents < MAX_PARENTS:
-        if at.constraints or at.parent_type != "OBJECT":
-            return np.array(object.matrix_world, np.float64)[:3, 3]
-        at, parents = at.parent, parents + 1
+    if _is_driven(object) and not _is_lost(object):
+        return np.array(object.matrix_world, np.float64)[:3, 3]
     return _resting(object)[:3, 3]
 
 
@@ -155,10 +156,24 @@ def release(object: bpy.types.Object) -> None:
     """
     settings = object.gi_volumes
     settings.kept = False
-    if is_pinned(object, place_of(object)):
+    if not settings.reach:
+        adopt(object)
+    elif is_pinned(object, place_of(object)):
         matrix = object.matrix_world.copy()
         matrix.translation = settings.placed
         object.matrix_world = matrix
+
+
+def adopt(object: bpy.types.Object) -> None:
+    """Take the place of a probe for the one that the bake gave it.
+
+    Parameters
+    ----------
+    object : bpy.types.Object
+        Stands for a probe.
+    """
+    settings = object.gi_volumes
+    settings.placed, settings.reach = place_of(object), settings.reach or USUAL_REACH
 
 
 def deleted(scene: bpy.types.Scene, found: list[bpy.types.Object]) -> list[tuple[tuple[float, ...], float]]:
@@ -218,6 +233,21 @@ def boxes(places: list[tuple[tuple[float, ...], float]]) -> np.ndarray:
     middle = np.array([place for place, _ in places], np.float64).reshape(-1, 1, 3)
     reach = np.array([reach for _, reach in places], np.float64).reshape(-1, 1, 1)
     return middle + reach * np.array([[[-1.0], [1.0]]])
+
+
+def _is_driven(object: bpy.types.Object) -> bool:
+    """Whether constraints, bones or vertices have a say in where an object is."""
+    at, parents = object, 0
+    while at is not None and parents < MAX_PARENTS:
+        if at.constraints or at.parent_type != "OBJECT":
+            return True
+        at, parents = at.parent, parents + 1
+    return False
+
+
+def _is_lost(object: bpy.types.Object) -> bool:
+    """Whether only Blender can say where an object is, and has not: matrices are not stored in files."""
+    return object.matrix_world.is_identity and _is_driven(object)
 
 
 def _resting(object: bpy.types.Object) -> np.ndarray:

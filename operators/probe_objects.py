@@ -32,8 +32,8 @@ def show(scene: bpy.types.Scene, baked: Baked) -> None:
     settings, old = scene.gi_volumes, probe_marks.probes_of(scene)
     _remember(settings.deleted_probes, probe_marks.missing(scene, old))
     pinned = [object for object in old if probe_marks.is_pinned(object, probe_marks.place_of(object))]
-    if baked.made != settings.shown_probes:
-        for object in pinned:
+    for object in pinned:
+        if baked.made != settings.shown_probes or not object.gi_volumes.reach:
             _keep(object)
     wanted = _wanted(baked, probe_marks.boxes(probe_marks.deleted(scene, old)))
     settings.shown_probes = baked.made
@@ -90,7 +90,7 @@ def usual_reach(scene: bpy.types.Scene) -> float:
     float [m]
         The median of those that the bake has placed; 1 without any.
     """
-    return float(np.median([item.reach for item in scene.gi_volumes.placed_probes] or [1.0]))
+    return float(np.median([item.reach for item in scene.gi_volumes.placed_probes] or [probe_marks.USUAL_REACH]))
 
 
 def forget_deleted(scene: bpy.types.Scene) -> int:
@@ -132,8 +132,8 @@ def _note(places, wanted: dict[tuple[float, ...], float]) -> None:
 
 def _keep(object: bpy.types.Object) -> None:
     """Pin a probe where it is: of the bake that is shown from now on no place is its home."""
-    settings, place = object.gi_volumes, probe_marks.place_of(object)
-    settings.kept, settings.placed = True, place
+    object.gi_volumes.kept = True
+    probe_marks.adopt(object)
 
 
 def _wanted(baked: Baked, boxes: np.ndarray) -> dict[tuple[float, ...], float]:

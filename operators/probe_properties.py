@@ -1,7 +1,7 @@
 """What objects that stand for reflection probes know of themselves, and what a scene remembers of those of its bake.
 
-A probe's object has the place that the bake gave it: elsewhere it counts as moved. A scene has the places of all that
-were shown: one that no object stands for any more was deleted.
+A probe's object has the place and the reach that the bake gave it: elsewhere it counts as moved, and without a reach it
+is an artist's own. A scene has the places of all that were shown: one that no object stands for any more was deleted.
 """
 
 import bpy
@@ -55,4 +55,4 @@ class GIVOLUMES_PG_object(bpy.types.PropertyGroup):
     )
     kept: BoolProperty(default=False, options={"HIDDEN"})
     placed: FloatVectorProperty(size=3, options={"HIDDEN"})
-    reach: FloatProperty(default=1.0, options={"HIDDEN"})
+    reach: FloatProperty(options={"HIDDEN"})

@@ -153,6 +153,66 @@ def test_a_probe_with_a_constraint_counts_where_that_puts_it(studio, show, extra
     assert extract().probes.pinned == pytest.approx(np.array([[7, 7, 7]]))
 
 
+@pytest.mark.parametrize("way", ["hide_viewport", "hide_render", "hide_set", "exclude"])
+def test_a_hidden_probe_with_a_constraint_counts_where_the_panel_says(studio, show, marks, extract, way):
+    probe, layer = show()[0], studio.bpy.context.view_layer
+    probe.constraints.new("COPY_LOCATION").target = studio.place(None, "target", (7, 7, 7))
+    layer.update()
+    if way == "exclude":
+        layer.layer_collection.children["GI Probes"].exclude = True
+    elif way == "hide_set":
+        probe.hide_set(True)
+    else:
+        setattr(probe, way, True)
+    assert probe.gi_volumes.pinned
+    assert marks.place_of(probe) == pytest.approx(np.array([7, 7, 7]))
+    assert extract().probes.pinned == pytest.approx(np.array([[7, 7, 7]]))
+
+
+def test_a_constraint_that_blender_never_evaluates_pins_a_probe_by_its_own_location(studio, show, extract, tmp_path):
+    bpy, probe = studio.bpy, show()[0]
+    probe.constraints.new("COPY_LOCATION").target = studio.place(None, "target", (7, 7, 7))
+    bpy.context.view_layer.layer_collection.children["GI Probes"].exclude = True
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    assert bpy.data.objects["GI Probe"].gi_volumes.pinned
+    assert extract().probes.pinned == pytest.approx(PLACES[:1])
+
+
+@pytest.mark.parametrize("place", [(0, 0, 0), (9, 9, 9)])
+def test_an_object_that_a_script_makes_a_probe_is_the_artists_wherever_it_is(studio, show, extract, place):
+    show()
+    own = studio.place(None, "own", place)
+    own.gi_volumes.role = "PROBE"
+    for made in (None, "one", "two"):
+        if made:
+            show(made=made)
+        assert own.gi_volumes.pinned
+        assert extract().probes.pinned == pytest.approx(np.array([place]))
+        assert len(extract().probes.deleted) == 0
+    studio.bpy.data.objects.remove(own)
+    assert extract().probes.deleted.mean(axis=1) == pytest.approx(np.array([place]))
+
+
+def test_an_object_that_a_script_made_a_probe_is_released_where_it_is(studio, show, extract):
+    show()
+    own = studio.place(None, "own", (9, 9, 9))
+    own.gi_volumes.role = "PROBE"
+    own.gi_volumes.pinned = False
+    assert tuple(own.location) == (9, 9, 9)
+    assert not own.gi_volumes.pinned
+    assert len(show()) == len(PLACES)
+    assert len(extract().probes.deleted) == 0
+
+
+def test_a_probe_that_the_bake_put_at_the_origin_is_the_bakes_in_a_file_too(studio, show, extract, tmp_path):
+    bpy = studio.bpy
+    show([[0, 0, 0], [2, 0, 0]])
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    assert len(extract().probes.pinned) == 0
+
+
 def test_instances_of_a_collection_pin_a_probe_each(studio, show, extract):
     bpy = studio.bpy
     show()

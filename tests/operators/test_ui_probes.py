@@ -103,7 +103,7 @@ assert bpy.context.object.gi_volumes.pinned and tuple(bpy.context.object.locatio
 print("STATUS", probe_panels.status(scene, probes()))
 ops.bake()
 second = files()
-print("CHANGED", sorted(name for name in first if second[name] != first[name]))
+print("CHANGED", sorted(name for name in first if second[name] != first[name] and not name.endswith(".probes")))
 import json
 listed = json.loads(second["world.json"])["probes"]
 assert [tuple(place) for place in listed["positions"][:2]] == [(62, 66, 1), (66.5, 65.5, -1)]
