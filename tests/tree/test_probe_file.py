@@ -183,7 +183,7 @@ def test_forged_images_are_refused(bake, changes, reason):
     "note", ['{"bake": "0123456789abcdef"}', '{"bake": "0123456789abcdef", "made": "", "x": NaN}', "[]"]
 )
 def test_a_file_of_no_bake_is_not_listed(bake, note):
-    place, header = bake
+    place, _ = bake
     images, _ = exr.decode((place / "probes.exr").read_bytes(), "")
     (place / "probes.exr").write_bytes(exr.encode(images, note))
     assert probe_file.describe(place) is None
