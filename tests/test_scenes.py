@@ -20,6 +20,8 @@ LONG = ("small_house", "bookstore", "modern_hall", "truck_town")
 POINTS = 100_000
 TOPOLOGY_BYTES = 300_000
 MEMORY_KB = 2_000_000
+DRAFT = ("--quality", "draft", "--sky", "1.0", "--probes", "none")
+"""Reflection probes would take longer than all the rest; small scenes of the other tests have them."""
 
 pytestmark = pytest.mark.skipif(not SCENES.is_dir(), reason=f"the public scenes are not in {SCENES}")
 
@@ -50,7 +52,7 @@ def surface_points(snapshot_path: Path) -> tuple[np.ndarray, np.ndarray]:
 def bake_and_query(name: str, folder: Path) -> dict:
     """Bake a scene under a white sky, verify it, and ask it everywhere."""
     baked = folder / "bake"
-    result = command("bake", str(SCENES / f"{name}.glb"), "-o", str(baked), "--quality", "draft", "--sky", "1.0")
+    result = command("bake", str(SCENES / f"{name}.glb"), "-o", str(baked), *DRAFT)
     assert command("verify", str(baked)) == {"defects": []}
     points, normals = surface_points(baked / "scene.giv")
     for file, values in (("p.npy", points), ("n.npy", normals)):
