@@ -245,7 +245,7 @@ def on_top(cell: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
 
 def scale_cell(baked: world.World, number: int, scale: float) -> None:
     """Multiply the payloads of one cell of a loaded world."""
-    values, first = baked._folded(baked._factors(None, None, "all")), baked._data.atlas.first
+    values, first = baked._folded(baked._sources.factors(None, None, "all")), baked._data.atlas.first
     values[first[number] : first[number + 1]] *= scale
 
 
