@@ -153,9 +153,7 @@ class Again(Refinement):
         """The state with those data points moved that are likely to move again."""
         row, moved, state = self._rows_of_moved(), self.memory.moved, self.state
         kept = np.flatnonzero(row >= 0)
-        measured = move(state.measured, row[kept], moved.offset[kept], moved.light[kept])
-        data = interpolate.join(self.grid, [state.tree], measured.offset, measured.valid)
-        return State(state.tree, measured, data, state.seen)
+        return self._with(state.tree, move(state.measured, row[kept], moved.offset[kept], moved.light[kept]))
 
     def _beside_surfaces(self) -> np.ndarray:
         """(points,) which data points have, or light, surfaces that have changed."""

@@ -195,8 +195,7 @@ def run(job: Job, show: Callable[[float], bool] = lambda share: True) -> Made:
     kept = probe_file.made_of(job.target, header["bake"]) == made
     if not kept:
         _capture(job, trees, header["bake"], made, _part_of(show, 0, 1 - SEEN))
-        folder.list_again(job.target)
-    _see_all(job, header, made, _part_of(show, 1 - SEEN, SEEN))
+    _see_all(job, folder.list_again(job.target), _part_of(show, 1 - SEEN, SEEN))
     listed = folder.list_again(job.target)
     said, file = listed["probes"]["said"], listed["probes"]["file"]
     size = file["bytes"] + sum(entry["files"].get("probes", {"bytes": 0})["bytes"] for entry in listed["cells"])
@@ -256,12 +255,13 @@ def _capture(job: Job, trees: tuple[Topology, ...], bake: str, made: str, show: 
     probe_file.write(job.target, maps, bake, made, said)
 
 
-def _see_all(job: Job, header: dict, made: str, show: Callable[[float], bool]) -> None:
-    """Write which probes count where, for cells that do not say so yet."""
-    place = probe_file.read(job.target / probe_file.PROBES)[0].position - job.scene.origin
-    cells = [tuple(entry["cell"]) for entry in header["cells"] if not entry.get("early")]
+def _see_all(job: Job, listed: dict, show: Callable[[float], bool]) -> None:
+    """Write which of the listed probes count where, for cells that do not say so yet."""
+    bake, made = listed["bake"], listed["probes"]["made"]
+    place = np.array(listed["probes"]["positions"], np.float64).reshape(-1, 3) - job.scene.origin
+    cells = [tuple(entry["cell"]) for entry in listed["cells"] if not entry.get("early")]
     for number, name in enumerate(cells):
-        if probe_cells.is_of(probe_cells.path_of(job.target, name), header["bake"], made):
+        if probe_cells.is_of(probe_cells.path_of(job.target, name), bake, made):
             continue
         cell = read_cell(job.target, name)
         data = join(job.grid, [cell.topology], cell.offset, cell.valid)

@@ -20,6 +20,7 @@ from ..tree.dualcells import CORNERS
 from ..tree.lookup import Atlas
 from ..tree.outline import Outline
 from ..tree.region import finder
+from ..tree.topology import Topology
 from . import cracks, hidden, occluders, parallel, receivers
 from .deadline import Pace
 from .gather import Effort
@@ -252,10 +253,14 @@ class Refinement:
         self.cut |= cap < target.max_points and tree.left_out > self.outline.left_out
         sampling = Sampling(target.effort, self.judge.views * LUMINANCE, NOISE * target.error)
         measured = measure(self.scene, self.grid, tree, sampling, self._known(), self._show())
-        data = interpolate.join(self.grid, [tree], measured.offset, measured.valid)
-        self.state = State(tree, measured, data, self.state and self.state.seen)
+        self.state = self._with(tree, measured)
         if self.pace:
             self.pace.grown(tree.size)
+
+    def _with(self, tree: Topology, measured: Measured) -> State:
+        """The state with other data points, without planes."""
+        data = interpolate.join(self.grid, [tree], measured.offset, measured.valid)
+        return State(tree, measured, data, self.state and self.state.seen)
 
     def _cap(self) -> int:
         """Most data points that there may be, and that there is time for."""
@@ -421,9 +426,7 @@ class Refinement:
         light = self._light_of_moved(row, offset)
         self.moved = Moved(row, offset, light)
         if len(row):
-            measured = move(self.unmoved, row, offset, light)
-            data = interpolate.join(self.grid, [self.state.tree], measured.offset, measured.valid)
-            self.state = State(self.state.tree, measured, data, self.state.seen)
+            self.state = self._with(self.state.tree, move(self.unmoved, row, offset, light))
 
     def _light_of_moved(self, row: np.ndarray, offset: np.ndarray) -> np.ndarray:
         """(m, functions, 9, 3) what data points measure elsewhere in their voxels."""
